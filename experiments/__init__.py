@@ -1,0 +1,1 @@
+"""Launchers: they parse flags, call the package and save."""

@@ -1,0 +1,1 @@
+"""Reinforcement learning as pure functions; a reward is a function handed in."""

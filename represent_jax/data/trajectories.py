@@ -1,0 +1,261 @@
+"""Trajectories, sets of demonstrations, and trajectories padded to one length.
+
+The layout is that of the `imitation` library: T+1 observations and T actions, the last observation
+being the true final one; the true reward and the demonstrator's strategy are kept beside them.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from represent_jax.errors import RepresentError
+
+# In float32 a clipped action may lie half a unit in the last place past a float64 bound.
+_BOUND_TOLERANCE = 1e-6
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One episode of one strategy.
+
+    Attributes:
+        obs: observations, the final one included, float32 [T+1, obs_dim].
+        actions: executed actions, float32 [T, action_dim].
+        rewards: true rewards, float32 [T].
+        terminated: whether the episode ended in a terminal state rather than at the time limit.
+        strategy: number of the demonstrator, counted from 0.
+
+    Raises:
+        RepresentError: on construction, when ranks or lengths disagree, T is 0, or a value is not
+            finite.
+    """
+
+    obs: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    terminated: bool
+    strategy: int
+
+    def __post_init__(self):
+        for name, rank in (("obs", 2), ("actions", 2), ("rewards", 1)):
+            object.__setattr__(self, name, _finite_float32(name, getattr(self, name), rank))
+        object.__setattr__(self, "terminated", bool(self.terminated))
+        object.__setattr__(self, "strategy", int(self.strategy))
+        if self.length < 1:
+            raise RepresentError("trajectory of zero length: it needs at least 1 action, has 0")
+        if len(self.obs) != self.length + 1:
+            raise RepresentError(
+                f"trajectory of {self.length} actions has {len(self.obs)} observations, "
+                f"it needs {self.length + 1}"
+            )
+        if len(self.rewards) != self.length:
+            raise RepresentError(
+                f"trajectory of {self.length} actions has {len(self.rewards)} rewards, "
+                f"it needs {self.length}"
+            )
+        if self.strategy < 0:
+            raise RepresentError(f"strategies count from 0, found {self.strategy}")
+
+    @property
+    def length(self) -> int:
+        """Number of actions T."""
+        return len(self.actions)
+
+    @property
+    def total_reward(self) -> float:
+        """Undiscounted true return."""
+        return float(self.rewards.sum(dtype=np.float64))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Demonstrations:
+    """Trajectories in one environment by M demonstrators, each with a strategy of its own.
+
+    Attributes:
+        env_name: name of the environment.
+        trajectories: the demonstrations, in any order of strategies.
+        metadata: where they come from; anything JSON can hold.
+
+    Raises:
+        RepresentError: on construction, when there are none, dimensions disagree, strategies are
+            not exactly 0, ..., M-1, or JSON cannot hold the metadata.
+    """
+
+    env_name: str
+    trajectories: tuple[Trajectory, ...]
+    metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        object.__setattr__(self, "trajectories", tuple(self.trajectories))
+        if not self.trajectories:
+            raise RepresentError(f"demonstrations of {self.env_name}: no trajectories")
+        for name, dim in (("obs", self.obs_dim), ("actions", self.action_dim)):
+            for i, trajectory in enumerate(self.trajectories):
+                found = getattr(trajectory, name).shape[1]
+                if found != dim:
+                    raise RepresentError(
+                        f"demonstrations of {self.env_name}: {name} of trajectory {i} have "
+                        f"{found} dimensions, those of trajectory 0 have {dim}"
+                    )
+        strategies = sorted({trajectory.strategy for trajectory in self.trajectories})
+        if strategies != list(range(len(strategies))):
+            raise RepresentError(
+                f"demonstrations of {self.env_name}: strategies are {strategies}, "
+                f"expected {list(range(len(strategies)))}"
+            )
+        try:
+            json.dumps(dict(self.metadata))
+        except (TypeError, ValueError) as error:
+            raise RepresentError(f"demonstrations of {self.env_name}: metadata: {error}") from error
+
+    @property
+    def obs_dim(self) -> int:
+        """Size of an observation."""
+        return self.trajectories[0].obs.shape[1]
+
+    @property
+    def action_dim(self) -> int:
+        """Size of an action."""
+        return self.trajectories[0].actions.shape[1]
+
+    @property
+    def num_strategies(self) -> int:
+        """Number of demonstrators M."""
+        return 1 + max(trajectory.strategy for trajectory in self.trajectories)
+
+    def of_strategy(self, strategy: int) -> tuple[Trajectory, ...]:
+        """Returns the trajectories of one demonstrator, counted from 0."""
+        return tuple(t for t in self.trajectories if t.strategy == strategy)
+
+    def mean_return(self, strategy: int) -> float:
+        """Returns the mean true return of one demonstrator, counted from 0."""
+        return float(np.mean([t.total_reward for t in self.of_strategy(strategy)]))
+
+    def check_against(
+        self,
+        obs_dim: int,
+        action_dim: int,
+        action_low: np.ndarray | float,
+        action_high: np.ndarray | float,
+    ) -> None:
+        """Checks that the demonstrations can come from an environment.
+
+        Args:
+            obs_dim: size of the environment's observations.
+            action_dim: size of its actions.
+            action_low: smallest actions, a number or [action_dim].
+            action_high: largest actions, a number or [action_dim].
+
+        Raises:
+            RepresentError: dimensions differ, or an action is out of bounds.
+        """
+        where = f"demonstrations of {self.env_name}"
+        for name, found, expected in (
+            ("observations", self.obs_dim, obs_dim),
+            ("actions", self.action_dim, action_dim),
+        ):
+            if found != expected:
+                raise RepresentError(
+                    f"{where}: {name} have {found} dimensions, the environment's have {expected}"
+                )
+        low, high = (np.broadcast_to(b, action_dim) for b in (action_low, action_high))
+        for i, trajectory in enumerate(self.trajectories):
+            below = trajectory.actions < low - _BOUND_TOLERANCE
+            above = trajectory.actions > high + _BOUND_TOLERANCE
+            if (below | above).any():
+                step, axis = np.argwhere(below | above)[0]
+                raise RepresentError(
+                    f"{where}: action {axis} at step {step} of trajectory {i} is "
+                    f"{trajectory.actions[step, axis]:g}, out of bounds "
+                    f"[{low[axis]:g}, {high[axis]:g}]"
+                )
+
+
+class TrajectoryBatch(NamedTuple):
+    """N trajectories padded to one horizon T; numpy or JAX arrays.
+
+    Attributes:
+        obs: observations [N, T+1, obs_dim]; past the end the final observation is repeated.
+        actions: executed actions [N, T, action_dim], zero past the end.
+        rewards: true rewards [N, T], zero past the end.
+        mask: 1 while the episode runs, 0 past the end, float32 [N, T].
+        strategy: number of the demonstrator, int32 [N].
+        noise_level: probability with which an action was replaced by a random one, float32 [N].
+    """
+
+    obs: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    mask: np.ndarray
+    strategy: np.ndarray
+    noise_level: np.ndarray
+
+
+def pad(
+    trajectories: Sequence[Trajectory], horizon: int, noise_level: np.ndarray | float = 0.0
+) -> TrajectoryBatch:
+    """Stacks trajectories of any lengths up to the horizon.
+
+    Args:
+        trajectories: N trajectories of equal dimensions, N >= 1.
+        horizon: length T of the batch, in steps.
+        noise_level: noise level of the trajectories, a number or [N].
+
+    Raises:
+        RepresentError: there are no trajectories, or one is longer than the horizon.
+    """
+    if not trajectories:
+        raise RepresentError("no trajectories to pad")
+    longest = max(trajectory.length for trajectory in trajectories)
+    if longest > horizon:
+        raise RepresentError(f"a trajectory of {longest} steps exceeds the horizon of {horizon}")
+    num = len(trajectories)
+    missing = [horizon - trajectory.length for trajectory in trajectories]
+    pairs = list(zip(trajectories, missing, strict=True))
+    return TrajectoryBatch(
+        obs=np.stack([np.pad(t.obs, ((0, m), (0, 0)), mode="edge") for t, m in pairs]),
+        actions=np.stack([np.pad(t.actions, ((0, m), (0, 0))) for t, m in pairs]),
+        rewards=np.stack([np.pad(t.rewards, (0, m)) for t, m in pairs]),
+        mask=np.stack([(np.arange(horizon) < t.length).astype(np.float32) for t, _ in pairs]),
+        strategy=np.array([t.strategy for t in trajectories], np.int32),
+        noise_level=np.broadcast_to(np.asarray(noise_level, np.float32), num).copy(),
+    )
+
+
+def unpad(batch: TrajectoryBatch) -> tuple[Trajectory, ...]:
+    """Returns the trajectories of a batch; those that stop before the horizon as terminated."""
+    obs, actions, rewards, mask, strategy, _ = (np.asarray(leaf) for leaf in batch)
+    lengths = mask.sum(axis=1).astype(int)
+    return tuple(
+        Trajectory(
+            obs=obs[i, : length + 1],
+            actions=actions[i, :length],
+            rewards=rewards[i, :length],
+            terminated=length < mask.shape[1],
+            strategy=strategy[i],
+        )
+        for i, length in enumerate(lengths)
+    )
+
+
+def returns(batch: TrajectoryBatch) -> np.ndarray:
+    """Returns the undiscounted true return of every trajectory [N]; works under jit."""
+    return (batch.rewards * batch.mask).sum(axis=-1)
+
+
+def _finite_float32(name: str, values: Any, rank: int) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        array = np.asarray(values, np.float32)
+    if array.ndim != rank:
+        raise RepresentError(f"{name} of a trajectory have {array.ndim} axes, they need {rank}")
+    bad = ~np.isfinite(array)
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise RepresentError(
+            f"{name} of a trajectory: {bad.sum()} of {array.size} values are not finite, "
+            f"the first ({array[first]}) at step {first[0]}"
+        )
+    return array

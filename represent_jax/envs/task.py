@@ -1,0 +1,78 @@
+"""What a robot task is, without a word about how its physics is stepped."""
+
+import abc
+from pathlib import Path
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from represent_jax.physics.engine import PhysicsState
+from represent_jax.physics.mjx import MjxSolver
+
+
+class Task(abc.ABC):
+    """One robot and what it is rewarded for: subclass this to add your own.
+
+    All methods see a single scene; batches are made by `jax.vmap`.
+
+    Attributes:
+      name: the name by which the task is registered.
+      frame_skip: physics substeps for each environment step.
+      horizon: environment steps after which an episode is cut off.
+      terminates: whether `terminated` ends episodes unless the user says otherwise.
+      derived_fields: `mujoco.MjData` fields that observation, reward or termination look at.
+      mjx_solver: solver settings of the `mjx` engine.
+    """
+
+    name: str
+    frame_skip: int
+    horizon: int = 1000
+    terminates: bool = False
+    derived_fields: tuple[str, ...] = ()
+    mjx_solver: MjxSolver = MjxSolver()
+
+    @abc.abstractmethod
+    def load_model(self) -> mujoco.MjModel:
+        """Compiles the scene."""
+
+    @abc.abstractmethod
+    def reset(self, key: jax.Array, init_qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draws an initial state.
+
+        Args:
+          key: PRNG key.
+          init_qpos: the model's reference positions, `[nq]`.
+
+        Returns:
+          Positions `[nq]` and velocities `[nv]`.
+        """
+
+    @abc.abstractmethod
+    def observe(self, physics: PhysicsState) -> jax.Array:
+        """Returns the observation, `[obs_dim]`."""
+
+    @abc.abstractmethod
+    def reward(
+        self, before: PhysicsState, action_t: jax.Array, after: PhysicsState, dt: float
+    ) -> jax.Array:
+        """Returns the reward of one environment step of `dt` seconds, `[]`."""
+
+    def terminated(self, physics: PhysicsState) -> jax.Array:
+        """Returns whether the episode has failed or succeeded for good, `[]` bool."""
+        del physics
+        return jnp.zeros((), bool)
+
+
+def load_gymnasium_model(file_name: str) -> mujoco.MjModel:
+    """Compiles one of the MJCF files that the installed gymnasium ships."""
+    folder = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+    spec = mujoco.MjSpec.from_file(str(folder / file_name))
+    # The attribute is deprecated and warns on every compilation; this is what it does.
+    total_mass, spec.compiler.settotalmass = spec.compiler.settotalmass, -1
+    model = spec.compile()
+    if total_mass > 0:
+        mujoco.mj_setTotalmass(model, total_mass)
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model

@@ -1,0 +1,1 @@
+"""Methods: which stages run in which order, with which settings."""

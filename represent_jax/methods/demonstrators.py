@@ -1,0 +1,191 @@
+"""Makes demonstrators that are imperfect and differ in style, and trajectories to test on.
+
+DIAYN with the environment's reward is stopped early, skill by skill: a skill's demonstrations
+come from the training snapshot whose return is nearest to the wanted one. The test set comes from
+snapshots of another seed, evenly spread over training, so that returns go from low to high.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from represent_jax.agents import sac
+from represent_jax.agents.rollout import rollout
+from represent_jax.agents.sac import SacConfig
+from represent_jax.config import require
+from represent_jax.data.trajectories import Trajectory, TrajectoryBatch, unpad
+from represent_jax.envs import Episode, make_env
+from represent_jax.runs.loop import advance
+from represent_jax.stages import diayn
+from represent_jax.stages.diayn import DiaynConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class DemonstratorConfig:
+    """Settings of one domain's demonstrators.
+
+    Attributes:
+      env: the environment's name.
+      seed: seed of the demonstrators.
+      test_seed: seed of the agent whose snapshots become the test set.
+      env_steps: training budget of the demonstrators.
+      test_env_steps: training budget of the test set's agent.
+      snapshot_env_steps: environment steps between two snapshots.
+      target_returns: wanted mean true return of each skill.
+      trajectories_per_skill: demonstrations of each skill.
+      test_snapshots: snapshots in the test set, the untrained agent among them.
+      test_trajectories_per_skill: test trajectories of each skill at each snapshot.
+      diayn: the agent.
+    """
+
+    env: str = "half_cheetah"
+    seed: int = 0
+    test_seed: int = 100
+    env_steps: int = 480_000
+    test_env_steps: int = 640_000
+    snapshot_env_steps: int = 8_000
+    target_returns: tuple[float, ...] = (1243.13, 1172.71, 1181.35)
+    trajectories_per_skill: int = 4
+    test_snapshots: int = 18
+    test_trajectories_per_skill: int = 2
+    diayn: DiaynConfig = DiaynConfig(num_skills=3)
+
+    def __post_init__(self) -> None:
+        require(
+            len(self.target_returns) == self.diayn.num_skills,
+            "target_returns",
+            f"one for each of {self.diayn.num_skills} skills",
+            self.target_returns,
+        )
+        require(self.seed != self.test_seed, "test_seed", "another than seed", self.test_seed)
+
+
+_SAC = SacConfig(initial_temperature=0.1, learning_rate=1e-3)
+
+DEMONSTRATORS = {
+    "half_cheetah": DemonstratorConfig(
+        diayn=DiaynConfig(num_skills=3, diversity_weight=3.0, sac=_SAC),
+    ),
+    "hopper": DemonstratorConfig(
+        env="hopper",
+        env_steps=960_000,
+        test_env_steps=1_280_000,
+        snapshot_env_steps=16_000,
+        target_returns=(1197.93, 1587.98),
+        test_trajectories_per_skill=3,
+        diayn=DiaynConfig(num_skills=2, diversity_weight=0.5, sac=_SAC),
+    ),
+    "inverted_double_pendulum": DemonstratorConfig(
+        env="inverted_double_pendulum",
+        env_steps=96_000,
+        test_env_steps=160_000,
+        snapshot_env_steps=3_200,
+        target_returns=(861.84, 1217.65),
+        trajectories_per_skill=40,
+        test_trajectories_per_skill=4,
+        diayn=DiaynConfig(num_skills=2, diversity_weight=1.0, sac=_SAC),
+    ),
+}
+
+
+class Snapshot(NamedTuple):
+    """Rollouts of all skills at one moment of training.
+
+    Attributes:
+      env_steps: environment steps trained so far.
+      trajectories: `[num_skills, num_episodes]`.
+    """
+
+    env_steps: int
+    trajectories: TrajectoryBatch
+
+
+def train(
+    config: DemonstratorConfig, seed: int, env_steps: int, num_episodes: int, backend: str = "auto"
+) -> list[Snapshot]:
+    """Trains one DIAYN agent and rolls out every skill at every snapshot."""
+    env = make_env(config.env, backend)
+    episodes, whole = Episode(env), Episode(env, auto_reset=False)
+    diayn_config = config.diayn
+    key_init, key_rollout = jax.random.split(jax.random.PRNGKey(seed))
+    state = jax.jit(lambda key: diayn.init(key, episodes, diayn_config))(key_init)
+    steps = config.snapshot_env_steps // diayn_config.sac.num_envs
+    train_steps = jax.jit(
+        lambda state: diayn.train(state, episodes, diayn_config, steps), donate_argnums=0
+    )
+
+    @jax.jit
+    def roll(params, key):
+        def one_skill(key, skill):
+            def policy(params, obs_t, key):
+                return diayn.act(params, skill, obs_t, key, diayn_config, env.action_size)
+
+            return rollout(whole, policy, params, key, jnp.zeros(num_episodes))
+
+        skills = jnp.arange(diayn_config.num_skills)
+        return jax.vmap(one_skill)(jax.random.split(key, skills.size), skills)
+
+    snapshots = []
+
+    def snap(state) -> Snapshot:
+        key = jax.random.fold_in(key_rollout, len(snapshots))
+        batch = jax.device_get(roll(sac.policy_of(state.sac.learner), key))
+        snapshots.append(Snapshot(int(state.sac.env_steps), batch))
+        return snapshots[-1]
+
+    def chunk(state):
+        state, metrics = train_steps(state)
+        returns = _returns(snap(state).trajectories).mean(axis=1)
+        skills = {f"return_{i}": value for i, value in enumerate(returns)}
+        return state, {**skills, "accuracy": metrics["discriminator_accuracy"]}
+
+    snap(state)
+    advance(
+        None,
+        f"{config.env} seed {seed}",
+        state,
+        chunk,
+        env_steps // config.snapshot_env_steps,
+        units_per_chunk=config.snapshot_env_steps,
+        describe=lambda m: " ".join(f"{float(v):.4g}" for v in m.values()),
+    )
+    return snapshots
+
+
+def _returns(batch: TrajectoryBatch) -> np.ndarray:
+    return (batch.rewards * batch.mask).sum(axis=-1)
+
+
+def choose_demonstrations(
+    snapshots: Sequence[Snapshot], target_returns: Sequence[float]
+) -> tuple[list[Trajectory], list[int]]:
+    """Takes each skill's demonstrations from the snapshot nearest to its target return.
+
+    Returns:
+      Trajectories of all skills, and the environment steps of each skill's snapshot.
+    """
+    returns = np.stack([_returns(s.trajectories).mean(axis=-1) for s in snapshots])
+    chosen = np.argmin(np.abs(returns - np.asarray(target_returns)), axis=0)
+    trajectories = []
+    for skill, index in enumerate(chosen):
+        batch = jax.tree.map(lambda x, skill=skill: x[skill], snapshots[index].trajectories)
+        trajectories += unpad(batch._replace(strategy=np.full_like(batch.strategy, skill)))
+    return trajectories, [snapshots[index].env_steps for index in chosen]
+
+
+def choose_test_set(
+    snapshots: Sequence[Snapshot], num_snapshots: int, per_skill: int
+) -> list[Trajectory]:
+    """Takes trajectories of all skills at snapshots evenly spread over training."""
+    chosen = np.unique(np.linspace(0, len(snapshots) - 1, num_snapshots).round().astype(int))
+    trajectories = []
+    for index in chosen:
+        batch = jax.tree.map(lambda x: x[:, :per_skill], snapshots[index].trajectories)
+        for skill in range(batch.mask.shape[0]):
+            one = jax.tree.map(lambda x, skill=skill: x[skill], batch)
+            trajectories += unpad(one._replace(strategy=np.full_like(one.strategy, skill)))
+    return trajectories

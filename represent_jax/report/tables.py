@@ -1,0 +1,149 @@
+"""Tables of a run against its demonstrators, as plain text and for the page."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from represent_jax.report.values import display_name, format_number
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A table of text.
+
+    Attributes:
+        title: what it shows.
+        columns: heads of the columns; the first column names the row.
+        rows: the cells.
+        note: how to read it, in a sentence or two.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str
+
+
+def targets(results: Mapping[str, Any]) -> list[str]:
+    """Returns "task", "strategy_1", ..., as many as the results tell of."""
+    num = results.get("strategies") or len(results.get("demonstrators") or ())
+    return ["task", *(f"strategy_{i + 1}" for i in range(num))]
+
+
+def demonstrator_levels(results: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Returns, by target, its demonstrators' mean true return and that of the best demonstrator."""
+    returns = [one["return_mean"] for one in results.get("demonstrators") or ()]
+    if not returns or any(value is None for value in returns):
+        return {}
+    levels = {"task": (sum(returns) / len(returns), max(returns))}
+    for i, value in enumerate(returns):
+        levels[f"strategy_{i + 1}"] = (value, max(returns))
+    return levels
+
+
+def returns_table(results: Mapping[str, Any]) -> Table | None:
+    """Returns the true returns of demonstrators, imitation and policies, or None without any."""
+    demonstrators = results.get("demonstrators") or ()
+    if not demonstrators:
+        return None
+    levels = demonstrator_levels(results)
+    imitation = results.get("airl") or ()
+    policies = results.get("policies") or {}
+    rows = []
+    for target in targets(results):
+        policy = policies.get(target) or {}
+        index = -1 if target == "task" else int(target.rpartition("_")[2]) - 1
+        shown, imitated = format_number(levels.get(target, (None,))[0]), "-"
+        if 0 <= index < len(demonstrators) and demonstrators[index].get("return_std") is not None:
+            shown += f" +- {format_number(demonstrators[index]['return_std'])}"
+        if 0 <= index < len(imitation):
+            imitated = format_number(imitation[index].get("return"))
+        ratio = policy.get("ratio_to_demonstrators")
+        rows.append(
+            (
+                display_name(target),
+                shown,
+                imitated,
+                format_number(policy.get("return_final")),
+                format_number(policy.get("return_best")),
+                "-" if ratio is None else f"{format_number(ratio, 2)}x",
+                format_number(policy.get("learned_return_final")),
+                _percent(policy.get("style_kept")),
+            )
+        )
+    return Table(
+        title="True return against the demonstrators",
+        columns=(
+            "target",
+            "demonstrators",
+            "imitation",
+            "final",
+            "best",
+            "vs demos",
+            "learned",
+            "style",
+        ),
+        rows=tuple(rows),
+        note="Mean episode return under the environment's own reward, which the method never sees, "
+        "of the demonstrators (the task's are all of them), of their imitation, and of the policy "
+        "trained on the learned reward: the final one, and the best met along the way. Vs demos: "
+        "final over demonstrators. Learned: the final policy's return under the learned reward, in "
+        "its own units. Style: share of states in which a strategy's policy is still recognised "
+        "as that strategy.",
+    )
+
+
+def rewards_table(results: Mapping[str, Any]) -> Table | None:
+    """Returns the correlations of learned with true return, or None without any."""
+    rewards = results.get("rewards") or {}
+    if not rewards:
+        return None
+    keys = (
+        "pearson_test",
+        "spearman_test",
+        "pearson_noisy",
+        "pearson_pooled",
+        "pearson_above_demonstrators",
+    )
+    rows = [
+        (display_name(target), *(format_number(rewards[target].get(key), 3) for key in keys))
+        for target in targets(results)
+        if rewards.get(target)
+    ]
+    return Table(
+        title="Learned against true return",
+        columns=("reward", "r, test", "rho, test", "r, noisy", "r, pooled", "r, above demos"),
+        rows=tuple(rows),
+        note="Pearson's r and Spearman's rho over whole trajectories: unseen test ones, the noisy "
+        "ones the reward was trained on, all pooled (as the paper reports it), and only the test "
+        "ones better than every demonstrator.",
+    )
+
+
+def summary(results: Mapping[str, Any]) -> str:
+    """Returns the tables of a run as plain text for the terminal, ASCII only.
+
+    Args:
+        results: what results.json holds; stages that are missing are left out.
+    """
+    tables = [returns_table(results), rewards_table(results)]
+    return "\n\n".join(to_text(table) for table in tables if table is not None)
+
+
+def to_text(table: Table) -> str:
+    """Returns the table with aligned columns, the first to the left and the others to the right."""
+    lines = [table.columns, *table.rows]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(table.columns))]
+
+    def join(cells: Sequence[str]) -> str:
+        padded = [cells[0].ljust(widths[0])]
+        padded += [cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True)]
+        return "  ".join(padded).rstrip()
+
+    rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
+    return "\n".join([table.title, rule, join(lines[0]), rule, *map(join, lines[1:]), rule])
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None or not math.isfinite(share) else f"{100 * share:.0f} %"

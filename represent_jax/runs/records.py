@@ -1,0 +1,161 @@
+"""Records of what was measured: one JSON object a line, appended by any number of processes."""
+
+import fcntl
+import functools
+import json
+import os
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from represent_jax.data.atomic import disk_errors
+from represent_jax.errors import RepresentError, UsageError, unknown
+from represent_jax.runs.directory import plain
+
+FIELDS = (
+    "domain",
+    "method",
+    "target",
+    "quantity",
+    "seed",
+    "value",
+    "preset",
+    "commit",
+    "config_hash",
+    "backend",
+    "device",
+    "versions",
+    "seconds",
+)
+
+_PACKAGES = (
+    "represent_jax",
+    "jax",
+    "jaxlib",
+    "mujoco",
+    "mujoco-mjx",
+    "brax",
+    "flax",
+    "optax",
+    "orbax-checkpoint",
+    "gymnasium",
+    "numpy",
+)
+
+
+def append_record(path: str | os.PathLike, **fields: Any) -> None:
+    """Appends one record to a file.
+
+    Args:
+        path: the file, made when missing.
+        **fields: a value for each of `FIELDS`; commit, device and versions are those of
+            `provenance` when left out. A value that is not finite becomes null.
+
+    Raises:
+        UsageError: a field is unknown or missing.
+        RepresentError: no space is left, or the file cannot be written.
+    """
+    for name in fields:
+        if name not in FIELDS:
+            raise unknown("field of a record", name, FIELDS)
+    given = provenance() | fields
+    missing = [name for name in FIELDS if name not in given]
+    if missing:
+        raise UsageError(f"a record needs {', '.join(missing)}")
+    line = json.dumps({name: plain(given[name]) for name in FIELDS}) + "\n"
+    path = Path(path)
+    with disk_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(line)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def read_records(path: str | os.PathLike, **filters: Any) -> list[dict[str, Any]]:
+    """Returns the records of a file, oldest first, that have the given values.
+
+    Args:
+        path: the file; one that is missing holds no records.
+        **filters: the values asked for, by field.
+
+    Raises:
+        RepresentError: a line is no record.
+        UsageError: a filter names no field.
+    """
+    for name in filters:
+        if name not in FIELDS:
+            raise unknown("field of a record", name, FIELDS)
+    path = Path(path)
+    records = []
+    for number, line in enumerate(path.read_text().splitlines() if path.exists() else (), start=1):
+        try:
+            record = json.loads(line)
+            if all(record[name] == value for name, value in filters.items()):
+                records.append(record)
+        except (ValueError, KeyError, TypeError) as error:
+            raise RepresentError(f"{path}: line {number} is no record") from error
+    return records
+
+
+@functools.cache
+def provenance() -> dict[str, Any]:
+    """Returns the commit, the device and the versions that a result comes from.
+
+    The commit is "unknown" outside a checkout, and ends in "-dirty" where the code differs from it.
+    """
+    return {"commit": _commit(), "device": _device(), "versions": _versions()}
+
+
+def _commit() -> str:
+    try:
+        root = Path(_git(Path(__file__).parent, "rev-parse", "--show-toplevel"))
+        commit = _git(root, "rev-parse", "--short=12", "HEAD")
+        # Records themselves are tracked files, so only changes of the code count.
+        changes = _git(root, "status", "--porcelain", "--", "represent_jax", "experiments")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    if not (root / "represent_jax").is_dir():
+        return "unknown"
+    return f"{commit}-dirty" if changes else commit
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(folder), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def _device() -> str:
+    cpu = f"{_cpu_model()} ({_num_cpus()} cores)"
+    device = jax.devices()[0]
+    return cpu if device.platform == "cpu" else f"{device.device_kind}, {cpu}"
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
+
+
+def _num_cpus() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions

@@ -1,0 +1,165 @@
+"""Demonstrators: DIAYN (https://arxiv.org/abs/1802.06070) with the environment's reward mixed in.
+
+One skill-conditioned SAC agent maximises
+
+  r(s, a, z) = r_env + beta * clip(log q(z|s') - log p(z)),
+
+REPRESENT's Eq. 6 in the mixture of its Eq. 1, with q a discriminator trained on replayed states
+and p uniform. The diversity reward is computed from the current discriminator at update time.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training import networks as brax_networks
+from flax import linen, struct
+
+from represent_jax.agents import sac
+from represent_jax.agents.sac import SacConfig
+from represent_jax.config import require
+from represent_jax.envs.episode import Episode
+from represent_jax.envs.skill import SkillConditioned
+from represent_jax.types import Metrics, Params
+
+
+@dataclasses.dataclass(frozen=True)
+class DiaynConfig:
+    """Settings of the demonstrators.
+
+    Attributes:
+      num_skills: number of skills; each becomes one demonstrator.
+      diversity_weight: beta, the weight of the diversity reward beside the environment's.
+      diversity_floor: lower bound of log q - log p, which is unbounded below.
+      discriminator_hidden_sizes: units of the discriminator's hidden layers.
+      discriminator_learning_rate: its Adam step size.
+      sac: the agent.
+    """
+
+    num_skills: int = 2
+    diversity_weight: float = 1.0
+    diversity_floor: float = -5.0
+    discriminator_hidden_sizes: tuple[int, ...] = (128, 128)
+    discriminator_learning_rate: float = 3e-4
+    sac: SacConfig = SacConfig()
+
+    def __post_init__(self) -> None:
+        require(self.num_skills >= 2, "num_skills", "at least 2", self.num_skills)
+        require(
+            self.sac.num_envs >= self.num_skills,
+            "sac.num_envs",
+            f"at least num_skills ({self.num_skills})",
+            self.sac.num_envs,
+        )
+
+
+@struct.dataclass
+class DiaynState:
+    """Training state.
+
+    Attributes:
+      sac: the agent's.
+      discriminator: parameters of q(z|s).
+      discriminator_opt: its optimiser's state.
+    """
+
+    sac: sac.SacState
+    discriminator: Params
+    discriminator_opt: optax.OptState
+
+
+@functools.lru_cache
+def _discriminator(obs_dim: int, config: DiaynConfig):
+    module = brax_networks.MLP(
+        layer_sizes=(*config.discriminator_hidden_sizes, config.num_skills),
+        activation=linen.relu,
+    )
+    return module, optax.adam(config.discriminator_learning_rate)
+
+
+def init(key: jax.Array, env: Episode, config: DiaynConfig) -> DiaynState:
+    """Starts training; each of the agent's environments belongs to one skill."""
+    key_sac, key_reset, key_discriminator = jax.random.split(key, 3)
+    conditioned = SkillConditioned(env, config.num_skills)
+    skills = jnp.arange(config.sac.num_envs) % config.num_skills
+    start = jax.vmap(conditioned.reset)(jax.random.split(key_reset, skills.size), skills)
+    agent = sac.init(key_sac, conditioned, config.sac, start)
+    module, optimizer = _discriminator(env.observation_size, config)
+    params = module.init(key_discriminator, jnp.zeros(env.observation_size))
+    return DiaynState(agent, params, optimizer.init(params))
+
+
+def log_skill_posterior(params: Params, obs_t: jax.Array, config: DiaynConfig) -> jax.Array:
+    """Log q(z|s), `[..., num_skills]`, of observations without the skill, `[..., obs_dim]`."""
+    module, _ = _discriminator(obs_t.shape[-1], config)
+    return jax.nn.log_softmax(module.apply(params, obs_t))
+
+
+def diversity_reward(log_posterior: jax.Array, skill: jax.Array, floor: float) -> jax.Array:
+    """Eq. 6 with a uniform prior: log q(z|s) + log num_skills, clipped to `[floor, 1]`.
+
+    Args:
+      log_posterior: `[..., num_skills]`.
+      skill: one-hot, `[..., num_skills]`.
+      floor: lower bound.
+    """
+    log_ratio = jnp.sum(log_posterior * skill, axis=-1) + jnp.log(skill.shape[-1])
+    return jnp.clip(log_ratio, floor, 1.0)
+
+
+def step(state: DiaynState, env: Episode, config: DiaynConfig) -> tuple[DiaynState, Metrics]:
+    """Takes one vectorised environment step; updates the discriminator, then the agent."""
+    conditioned = SkillConditioned(env, config.num_skills)
+    agent, transitions = sac.collect(state.sac, conditioned, config.sac)
+    agent, batches = sac.draw(agent, conditioned, config.sac)
+    next_obs = batches.next_obs_t[..., : -config.num_skills]
+    skill = batches.next_obs_t[..., -config.num_skills :]
+
+    def loss_fn(params):
+        log_posterior = log_skill_posterior(params, next_obs, config)
+        return -jnp.mean(jnp.sum(log_posterior * skill, axis=-1)), log_posterior
+
+    (loss, log_posterior), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.discriminator)
+    _, optimizer = _discriminator(env.observation_size, config)
+    updates, discriminator_opt = optimizer.update(grads, state.discriminator_opt)
+    discriminator = optax.apply_updates(state.discriminator, updates)
+
+    diversity = diversity_reward(log_posterior, skill, config.diversity_floor)
+    reward_t = batches.reward_t + config.diversity_weight * diversity
+    agent, metrics = sac.learn(agent, batches._replace(reward_t=reward_t), config.sac)
+    hit = jnp.argmax(log_posterior, axis=-1) == jnp.argmax(skill, axis=-1)
+    metrics = {
+        **metrics,
+        "env_reward": jnp.mean(transitions.reward_t),
+        "discriminator_loss": loss,
+        "discriminator_accuracy": jnp.mean(hit),
+    }
+    return DiaynState(agent, discriminator, discriminator_opt), metrics
+
+
+def train(
+    state: DiaynState, env: Episode, config: DiaynConfig, num_steps: int
+) -> tuple[DiaynState, Metrics]:
+    """Scans `step`; metrics are averaged over the steps."""
+    state, metrics = jax.lax.scan(
+        lambda state, _: step(state, env, config), state, None, length=num_steps
+    )
+    return state, jax.tree.map(jnp.mean, metrics)
+
+
+def act(
+    params: sac.PolicyParams,
+    skill: jax.Array | int,
+    obs_t: jax.Array,
+    key: jax.Array,
+    config: DiaynConfig,
+    action_dim: int,
+    deterministic: bool = False,
+) -> jax.Array:
+    """Acts with one skill on observations without it, `[batch, obs_dim]`."""
+    one_hot = jax.nn.one_hot(skill, config.num_skills)
+    one_hot = jnp.broadcast_to(one_hot, (*obs_t.shape[:-1], config.num_skills))
+    conditioned = jnp.concatenate([obs_t, one_hot], axis=-1)
+    return sac.act(params, conditioned, key, config.sac, action_dim, deterministic)

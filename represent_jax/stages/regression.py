@@ -1,0 +1,427 @@
+"""Phase 3: joint regression of the task reward and every strategy's own.
+
+REPRESENT's Eq. 1, R^i = R^0 + alpha_i R~^i, is fitted with the three terms of Eq. 2:
+
+  SSRR   snippets of noisy rollouts sum to their share of the noise-performance curve (Eq. 3);
+  reg    R~^i stays small, on the states of all strategies (Eq. 4);
+  BCD    R^i pays more on strategy i's demonstrations than on the others' (Eq. 5).
+
+Rewards of one step are small: a whole noise-free episode is worth `return_scale`. Where a term
+needs a scale-free quantity it uses rho = r * horizon / return_scale, whose mean over such an
+episode is 1.
+"""
+
+import dataclasses
+import enum
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen, struct
+
+from represent_jax.config import require
+from represent_jax.data.trajectories import TrajectoryBatch
+from represent_jax.types import Metrics, Params
+
+
+class Discrimination(enum.StrEnum):
+    """How Eq. 5 is read; u_i(m) is the mean of rho^i over a demonstration of strategy m.
+
+    LOG_RATIO: (u_i(m) - sg u_i(i) - log w)^2, Eq. 5 in the exponent: a bounded target.
+    FLAIR: (exp u_i(m) - w exp sg u_i(i))^2, the loss of FLAIR's code with target ratio w.
+    LITERAL: (exp u_i(i) - exp u_i(m))^2, Eq. 5 as printed; it makes strategies equal.
+    """
+
+    LOG_RATIO = "log_ratio"
+    FLAIR = "flair"
+    LITERAL = "literal"
+
+
+@dataclasses.dataclass(frozen=True)
+class RegressionConfig:
+    """Settings of Phase 3.
+
+    Attributes:
+      num_updates: Adam steps.
+      num_snippets: snippets of each strategy in a step.
+      states_per_snippet: states drawn from a snippet to estimate its sum; even.
+      num_demonstration_states: states of each strategy's demonstrations in a step.
+      min_snippet_steps, max_snippet_steps: range of a snippet's length.
+      hidden_sizes: units of the hidden layers of every head.
+      learning_rate: Adam's step size.
+      kernel_scale: standard deviation of initial kernels (SSRR: 0.001).
+      l2: weight of the squared kernels (SSRR: 0.1).
+      ensemble_size: independent copies, whose mean is the reward.
+      return_scale: learned return of a whole episode whose curve value is 1 (SSRR: 10).
+      strategy_weight: alpha_i of Eq. 1, for all strategies.
+      lambda_ssrr, lambda_reg, lambda_bcd: weights of Eq. 2's terms.
+      discrimination: reading of Eq. 5.
+      discrimination_ratio: w, target of exp u_i(m) / exp u_i(i).
+      include_action: whether rewards see state and action as well as the next state.
+    """
+
+    num_updates: int = 3000
+    num_snippets: int = 64
+    states_per_snippet: int = 16
+    num_demonstration_states: int = 256
+    min_snippet_steps: int = 50
+    max_snippet_steps: int = 500
+    hidden_sizes: tuple[int, ...] = (256, 256)
+    learning_rate: float = 1e-4
+    kernel_scale: float = 1e-3
+    l2: float = 0.1
+    ensemble_size: int = 1
+    return_scale: float = 10.0
+    strategy_weight: float = 1.0
+    lambda_ssrr: float = 1.0
+    lambda_reg: float = 0.1
+    lambda_bcd: float = 0.01
+    discrimination: str = "log_ratio"
+    discrimination_ratio: float = 0.7
+    include_action: bool = False
+
+    def __post_init__(self) -> None:
+        for field in ("num_updates", "num_snippets", "ensemble_size", "min_snippet_steps"):
+            require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
+        require(
+            self.states_per_snippet >= 2 and self.states_per_snippet % 2 == 0,
+            "states_per_snippet",
+            "even and at least 2",
+            self.states_per_snippet,
+        )
+        require(
+            self.max_snippet_steps >= self.min_snippet_steps,
+            "max_snippet_steps",
+            f"at least min_snippet_steps ({self.min_snippet_steps})",
+            self.max_snippet_steps,
+        )
+        readings = tuple(Discrimination)
+        require(
+            self.discrimination in readings,
+            "discrimination",
+            f"one of {', '.join(readings)}",
+            self.discrimination,
+        )
+        require(
+            0.0 < self.discrimination_ratio <= 1.0,
+            "discrimination_ratio",
+            "in (0, 1]",
+            self.discrimination_ratio,
+        )
+
+
+class Rewards(NamedTuple):
+    """Parameters of all rewards.
+
+    Attributes:
+      task: R^0, leaves `[ensemble, ...]`.
+      strategies: R~^1 to R~^M, leaves `[ensemble, num_strategies, ...]`.
+    """
+
+    task: Params
+    strategies: Params
+
+
+class RegressionData(NamedTuple):
+    """What Phase 3 learns from; leading axis `[num_strategies]` throughout.
+
+    Attributes:
+      noisy: noisy rollouts, `[num_strategies, num_trajectories]`.
+      targets: curve value of each rollout's noise level, `[num_strategies, num_trajectories]`.
+      demonstrations: padded demonstrations, `[num_strategies, num_demonstrations]`.
+    """
+
+    noisy: TrajectoryBatch
+    targets: jax.Array
+    demonstrations: TrajectoryBatch
+
+
+@struct.dataclass
+class RegressionState:
+    """Training state: parameters, optimiser and key."""
+
+    rewards: Rewards
+    opt: optax.OptState
+    key: jax.Array
+
+
+class Snippets(NamedTuple):
+    """Sampled states of snippets and what the snippets are worth.
+
+    Attributes:
+      inputs: `[..., num_snippets, states_per_snippet, input_dim]`.
+      share: the snippet's length over the horizon, `[..., num_snippets]`.
+      target: curve value, `[..., num_snippets]`.
+    """
+
+    inputs: jax.Array
+    share: jax.Array
+    target: jax.Array
+
+
+class _Head(linen.Module):
+    hidden_sizes: tuple[int, ...]
+    kernel_scale: float
+
+    @linen.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        kernel_init = jax.nn.initializers.normal(self.kernel_scale)
+        for size in self.hidden_sizes:
+            x = linen.relu(linen.Dense(size, kernel_init=kernel_init)(x))
+        return linen.Dense(1, kernel_init=kernel_init)(x)[..., 0]
+
+
+@functools.lru_cache
+def _head(config: RegressionConfig) -> _Head:
+    return _Head(config.hidden_sizes, config.kernel_scale)
+
+
+@functools.lru_cache
+def _optimizer(config: RegressionConfig) -> optax.GradientTransformation:
+    return optax.adam(config.learning_rate)
+
+
+def init(
+    key: jax.Array, obs_dim: int, action_dim: int, num_strategies: int, config: RegressionConfig
+) -> RegressionState:
+    """Draws all heads of all ensemble members."""
+    key_task, key_strategies, key = jax.random.split(key, 3)
+    input_dim = obs_dim + (obs_dim + action_dim if config.include_action else 0)
+    head = _head(config)
+
+    def draw(key):
+        return head.init(key, jnp.zeros(input_dim))
+
+    shape = (config.ensemble_size, num_strategies)
+    task = jax.vmap(draw)(jax.random.split(key_task, config.ensemble_size))
+    strategies = jax.vmap(jax.vmap(draw))(jax.random.split(key_strategies, shape))
+    rewards = Rewards(task, strategies)
+    return RegressionState(rewards, _optimizer(config).init(rewards), key)
+
+
+def inputs_of(
+    obs_t: jax.Array, action_t: jax.Array, next_obs_t: jax.Array, config: RegressionConfig
+) -> jax.Array:
+    """What a head sees: the state that the action led to, and on request what came before."""
+    if not config.include_action:
+        return next_obs_t
+    return jnp.concatenate([next_obs_t, obs_t, action_t], axis=-1)
+
+
+def sample_snippets(
+    key: jax.Array, trajectories: TrajectoryBatch, targets: jax.Array, config: RegressionConfig
+) -> Snippets:
+    """Draws snippets of one strategy and some states of each.
+
+    Start and length are uniform; a snippet never leaves the steps in which its episode ran, and
+    its share of the curve's value is its length over the nominal horizon, so that in a domain
+    that terminates a longer life is worth more.
+
+    Args:
+      key: PRNG key.
+      trajectories: `[num_trajectories]`.
+      targets: curve values, `[num_trajectories]`.
+      config: settings.
+    """
+    key_index, key_length, key_start, key_states = jax.random.split(key, 4)
+    num_trajectories, horizon = trajectories.mask.shape
+    shape = (config.num_snippets,)
+    index = jax.random.randint(key_index, shape, 0, num_trajectories)
+    alive = jnp.sum(trajectories.mask[index], axis=-1).astype(jnp.int32)
+    longest = min(config.max_snippet_steps, horizon)
+    shortest = min(config.min_snippet_steps, longest)
+    length = jnp.minimum(jax.random.randint(key_length, shape, shortest, longest + 1), alive)
+    start = jnp.floor(jax.random.uniform(key_start, shape) * (alive - length + 1)).astype(jnp.int32)
+    offset = jax.random.uniform(key_states, (*shape, config.states_per_snippet))
+    steps = start[:, None] + jnp.floor(offset * length[:, None]).astype(jnp.int32)
+    index = index[:, None]
+    inputs = inputs_of(
+        trajectories.obs[index, steps],
+        trajectories.actions[index, steps],
+        trajectories.obs[index, steps + 1],
+        config,
+    )
+    return Snippets(inputs, length / horizon, targets[index[:, 0]])
+
+
+def ssrr_loss(rho: jax.Array, snippets: Snippets, return_scale: float) -> jax.Array:
+    """Eq. 3 on snippets: (sum_t R(s_t) - S sigma L / T)^2, estimated without bias.
+
+    The square of a mean over sampled states would carry their variance; the product of the
+    errors of two independent halves does not.
+
+    Args:
+      rho: rewards of the sampled states in units of S / T, `[num_snippets, states]`.
+      snippets: shares and targets.
+      return_scale: S.
+    """
+    first, second = jnp.split(rho, 2, axis=-1)
+    scale = return_scale * snippets.share
+    error_first = scale * (jnp.mean(first, axis=-1) - snippets.target)
+    error_second = scale * (jnp.mean(second, axis=-1) - snippets.target)
+    return jnp.mean(error_first * error_second)
+
+
+def discrimination_loss(utility: jax.Array, config: RegressionConfig) -> jax.Array:
+    """Eq. 5, summed over all ordered pairs of strategies.
+
+    Args:
+      utility: u_i(m), mean rho^i over strategy m's demonstrations, `[num_strategies (i), (m)]`.
+      config: the reading and its ratio.
+    """
+    num_strategies = utility.shape[0]
+    utility = jnp.clip(utility, -5.0, 5.0)
+    own = jnp.diagonal(utility)[:, None]
+    ratio = config.discrimination_ratio
+    if config.discrimination == Discrimination.LOG_RATIO:
+        gap = utility - jax.lax.stop_gradient(own) - jnp.log(ratio)
+    elif config.discrimination == Discrimination.FLAIR:
+        gap = jnp.exp(utility) - ratio * jnp.exp(jax.lax.stop_gradient(own))
+    else:
+        gap = jnp.exp(own) - jnp.exp(utility)
+    return jnp.sum(jnp.square(gap) * (1.0 - jnp.eye(num_strategies)))
+
+
+def loss(
+    rewards: Rewards,
+    snippets: Snippets,
+    demonstration_inputs: jax.Array,
+    horizon: int,
+    config: RegressionConfig,
+) -> tuple[jax.Array, Metrics]:
+    """Eq. 2 of one ensemble member.
+
+    Args:
+      rewards: without the ensemble axis.
+      snippets: `[num_strategies, ...]`.
+      demonstration_inputs: states of demonstrations, `[num_strategies, states, input_dim]`.
+      horizon: T.
+      config: settings.
+    """
+    head = _head(config)
+    num_strategies, num_states, input_dim = demonstration_inputs.shape
+    unit = horizon / config.return_scale
+    rho_task = unit * head.apply(rewards.task, snippets.inputs)
+    rho_own = unit * jax.vmap(head.apply)(rewards.strategies, snippets.inputs)
+    alpha = config.strategy_weight
+    ssrr = jax.vmap(ssrr_loss, in_axes=(0, 0, None))(
+        rho_task + alpha * rho_own, snippets, config.return_scale
+    )
+    # Every strategy's head on every strategy's demonstrations, [i, m, states].
+    flat = demonstration_inputs.reshape(-1, input_dim)
+    rho_cross = unit * jax.vmap(head.apply, in_axes=(0, None))(rewards.strategies, flat)
+    rho_cross = rho_cross.reshape(num_strategies, num_strategies, num_states)
+    rho_task_demo = unit * jax.lax.stop_gradient(head.apply(rewards.task, demonstration_inputs))
+    utility = jnp.mean(rho_task_demo[None] + alpha * rho_cross, axis=-1)
+    reg = jnp.sum(jnp.mean(jnp.square(rho_own), axis=(1, 2)))
+    reg += jnp.sum(jnp.mean(jnp.square(rho_cross), axis=(1, 2)))
+    bcd = discrimination_loss(utility, config)
+    l2 = sum(jnp.sum(jnp.square(kernel)) for kernel in _kernels(rewards))
+    total = (
+        config.lambda_ssrr * jnp.sum(ssrr)
+        + config.lambda_reg * reg
+        + config.lambda_bcd * bcd
+        + config.l2 * l2
+    )
+    own = jnp.diagonal(jnp.mean(rho_cross, axis=-1))
+    others = jnp.sum(jnp.mean(rho_cross, axis=-1)) - jnp.sum(own)
+    metrics = {
+        "loss": total,
+        "ssrr_loss": jnp.mean(ssrr),
+        "reg_loss": reg,
+        "bcd_loss": bcd,
+        "l2_loss": l2,
+        "strategy_reward_own": jnp.mean(own),
+        "strategy_reward_others": others / jnp.maximum(num_strategies * (num_strategies - 1), 1),
+    }
+    return total, metrics
+
+
+def _kernels(rewards: Rewards) -> list[jax.Array]:
+    leaves = jax.tree_util.tree_leaves_with_path(rewards)
+    return [leaf for path, leaf in leaves if path[-1].key == "kernel"]
+
+
+def _sample_states(key: jax.Array, batch: TrajectoryBatch, config: RegressionConfig) -> jax.Array:
+    """Draws states in which episodes of one strategy ran, `[num_demonstration_states, dim]`."""
+    weights = batch.mask.reshape(-1)
+    shape = (config.num_demonstration_states,)
+    # Inverse transform: exact and cheap, where `choice` would sort.
+    cumulative = jnp.cumsum(weights)
+    draw = jax.random.uniform(key, shape) * cumulative[-1]
+    flat = jnp.searchsorted(cumulative, draw, side="right")
+    index, step = jnp.divmod(jnp.minimum(flat, weights.size - 1), batch.mask.shape[1])
+    return inputs_of(
+        batch.obs[index, step], batch.actions[index, step], batch.obs[index, step + 1], config
+    )
+
+
+def step(
+    state: RegressionState, data: RegressionData, config: RegressionConfig
+) -> tuple[RegressionState, Metrics]:
+    """Makes one Adam step on every ensemble member, each with snippets of its own."""
+    key_members, key = jax.random.split(state.key)
+    num_strategies, _, horizon = data.noisy.mask.shape
+
+    def member_loss(rewards, key):
+        key_snippets, key_states = jax.random.split(key)
+        snippets = jax.vmap(sample_snippets, in_axes=(0, 0, 0, None))(
+            jax.random.split(key_snippets, num_strategies), data.noisy, data.targets, config
+        )
+        states = jax.vmap(_sample_states, in_axes=(0, 0, None))(
+            jax.random.split(key_states, num_strategies), data.demonstrations, config
+        )
+        return loss(rewards, snippets, states, horizon, config)
+
+    keys = jax.random.split(key_members, config.ensemble_size)
+    grads, metrics = jax.vmap(jax.grad(member_loss, has_aux=True))(state.rewards, keys)
+    updates, opt = _optimizer(config).update(grads, state.opt)
+    rewards = optax.apply_updates(state.rewards, updates)
+    return RegressionState(rewards, opt, key), jax.tree.map(jnp.mean, metrics)
+
+
+def train(
+    state: RegressionState, data: RegressionData, config: RegressionConfig, num_updates: int
+) -> tuple[RegressionState, Metrics]:
+    """Scans `step`; metrics are averaged over the steps."""
+    state, metrics = jax.lax.scan(
+        lambda state, _: step(state, data, config), state, None, length=num_updates
+    )
+    return state, jax.tree.map(jnp.mean, metrics)
+
+
+def select(rewards: Rewards, strategy: int | None) -> tuple[Params, ...]:
+    """Picks the heads whose sum is one target's reward.
+
+    Args:
+      rewards: all heads.
+      strategy: None for the task reward R^0, else the strategy i of R^i, counted from 0.
+
+    Returns:
+      The task head alone, or with one strategy's; leaves `[ensemble, ...]`.
+    """
+    if strategy is None:
+        return (rewards.task,)
+    return rewards.task, jax.tree.map(lambda leaf: leaf[:, strategy], rewards.strategies)
+
+
+def reward(
+    heads: tuple[Params, ...],
+    obs_t: jax.Array,
+    action_t: jax.Array,
+    next_obs_t: jax.Array,
+    config: RegressionConfig,
+) -> jax.Array:
+    """R^0, or R^i = R^0 + alpha_i R~^i, the mean over the ensemble, `[...]`.
+
+    Args:
+      heads: what `select` returns.
+      obs_t, action_t, next_obs_t: `[..., dim]`.
+      config: settings.
+    """
+    inputs = inputs_of(obs_t, action_t, next_obs_t, config)
+    apply = jax.vmap(_head(config).apply, in_axes=(0, None))
+    values = [jnp.mean(apply(head, inputs), axis=0) for head in heads]
+    return values[0] + config.strategy_weight * sum(values[1:], jnp.zeros(()))

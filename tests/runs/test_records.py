@@ -1,0 +1,108 @@
+import json
+import multiprocessing
+import subprocess
+
+import numpy as np
+import pytest
+
+from represent_jax import runs
+from represent_jax.errors import RepresentError, UsageError
+from represent_jax.runs import records
+
+
+def fields(**changes):
+    values = {
+        "domain": "cart",
+        "method": "represent",
+        "target": "strategy_1",
+        "quantity": "pearson_test",
+        "seed": 0,
+        "value": 0.93,
+        "preset": "smoke",
+        "config_hash": "0123456789ab",
+        "backend": "mjx",
+        "seconds": 12.5,
+    }
+    return values | changes
+
+
+def test_append_and_read(tmp_path):
+    path = tmp_path / "results" / "records.jsonl"
+    assert runs.read_records(path) == []
+    runs.append_record(path, **fields())
+    runs.append_record(path, **fields(seed=1, value=np.float32(0.5)))
+    runs.append_record(path, **fields(seed=2, value=np.nan, commit="abc"))
+    everything = runs.read_records(path)
+    assert [tuple(record) for record in everything] == [records.FIELDS] * 3
+    assert [record["value"] for record in everything] == [0.93, 0.5, None]
+    assert everything[0]["versions"]["jax"]
+    assert everything[2]["commit"] == "abc"
+    assert runs.read_records(path, seed=1, target="strategy_1") == [everything[1]]
+    assert runs.read_records(path, domain="pole") == []
+
+
+def test_bad_records(tmp_path):
+    path = tmp_path / "records.jsonl"
+    with pytest.raises(UsageError, match="unknown field of a record 'sed': did you mean seed"):
+        runs.append_record(path, **fields(sed=1))
+    with pytest.raises(UsageError, match="a record needs domain, method"):
+        runs.append_record(path, seed=0)
+    with pytest.raises(UsageError, match="unknown field of a record 'sed'"):
+        runs.read_records(path, sed=1)
+    runs.append_record(path, **fields())
+    with open(path, "a") as file:
+        file.write('{"domain": ')
+    with pytest.raises(RepresentError, match=r"records.jsonl: line 2 is no record"):
+        runs.read_records(path)
+
+
+def test_lines_of_several_processes_stay_whole(tmp_path):
+    path = tmp_path / "records.jsonl"
+    given = fields(commit="c" * 20_000, device="d", versions={})
+    context = multiprocessing.get_context("spawn")
+    writers = [
+        context.Process(target=append_many, args=(path, given | {"seed": seed}))
+        for seed in range(2)
+    ]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert [w.exitcode for w in writers] == [0, 0]
+    assert sorted(record["seed"] for record in runs.read_records(path)) == [0] * 20 + [1] * 20
+
+
+def append_many(path, given):
+    for _ in range(20):
+        runs.append_record(path, **given)
+
+
+def test_provenance():
+    found = runs.provenance()
+    json.dumps(found)
+    assert found["device"]
+    assert {"python", "jax", "numpy"} <= set(found["versions"])
+
+
+def test_commit_of_a_checkout(tmp_path, monkeypatch):
+    def git(*arguments):
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "commit.gpgsign=false"]
+        subprocess.run(
+            ["git", *identity, *arguments], cwd=tmp_path, check=True, capture_output=True
+        )
+
+    code = tmp_path / "represent_jax" / "runs" / "records.py"
+    code.parent.mkdir(parents=True)
+    code.write_text("")
+    monkeypatch.setattr(records, "__file__", str(code))
+    assert records._commit() == "unknown"
+    git("init")
+    assert records._commit() == "unknown"
+    git("add", ".")
+    git("commit", "-m", "first")
+    commit = records._commit()
+    assert len(commit) == 12 and not commit.endswith("-dirty")
+    (tmp_path / "records.jsonl").write_text("")
+    assert records._commit() == commit
+    code.write_text("x = 1")
+    assert records._commit() == f"{commit}-dirty"
