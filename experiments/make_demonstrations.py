@@ -4,15 +4,15 @@
 """
 
 import os
-import sys
 from pathlib import Path
 
-from absl import app, flags
+from absl import flags
 
+from experiments import launch
 from represent_jax import config as configs
 from represent_jax.data.npz import save_demonstrations
 from represent_jax.data.trajectories import Demonstrations
-from represent_jax.errors import RepresentError, unknown
+from represent_jax.errors import unknown
 from represent_jax.methods import demonstrators
 from represent_jax.stages import style
 
@@ -24,8 +24,7 @@ _BACKEND = flags.DEFINE_string("backend", "auto", "Physics engine: auto, mujoco 
 
 
 def main(argv: list[str]) -> None:
-    if len(argv) > 1:
-        raise app.UsageError(f"unexpected arguments: {' '.join(argv[1:])}")
+    launch.refuse_arguments(argv)
     if _ENV.value not in demonstrators.DEMONSTRATORS:
         raise unknown("environment", _ENV.value, demonstrators.DEMONSTRATORS)
     config = demonstrators.DEMONSTRATORS[_ENV.value]
@@ -80,14 +79,5 @@ def _make_test_set(config: demonstrators.DemonstratorConfig, path: Path) -> None
     print(f"{len(returns)} test trajectories, returns {returns[0]:.0f} to {returns[-1]:.0f}: {path}")
 
 
-def run() -> None:
-    """Entry point: errors of use and of data are one line."""
-    try:
-        app.run(main)
-    except RepresentError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
-
-
 if __name__ == "__main__":
-    run()
+    launch.run(main)

@@ -139,12 +139,14 @@ def make_networks(obs_dim: int, action_dim: int, config: SacConfig) -> Networks:
         if config.normalize_observations
         else brax_types.identity_observation_preprocessor
     )
-    networks = sac_networks.make_sac_networks(
-        obs_dim,
-        action_dim,
-        preprocess_observations_fn=preprocess,
-        hidden_layer_sizes=config.hidden_sizes,
-    )
+    # Brax keeps example inputs in closures; made under a trace they would be leaked tracers.
+    with jax.ensure_compile_time_eval():
+        networks = sac_networks.make_sac_networks(
+            obs_dim,
+            action_dim,
+            preprocess_observations_fn=preprocess,
+            hidden_layer_sizes=config.hidden_sizes,
+        )
     losses = sac_losses.make_losses(networks, config.reward_scale, config.discount, action_dim)
     return Networks(networks, *losses, optax.adam(config.learning_rate))
 

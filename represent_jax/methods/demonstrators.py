@@ -68,7 +68,7 @@ _SAC = SacConfig(initial_temperature=0.1, learning_rate=1e-3)
 
 DEMONSTRATORS = {
     "half_cheetah": DemonstratorConfig(
-        diayn=DiaynConfig(num_skills=3, diversity_weight=3.0, sac=_SAC),
+        diayn=DiaynConfig(num_skills=3, diversity_weight=2.0, sac=_SAC),
     ),
     "hopper": DemonstratorConfig(
         env="hopper",
@@ -83,11 +83,11 @@ DEMONSTRATORS = {
         env="inverted_double_pendulum",
         env_steps=96_000,
         test_env_steps=160_000,
-        snapshot_env_steps=3_200,
+        snapshot_env_steps=1_600,
         target_returns=(861.84, 1217.65),
         trajectories_per_skill=40,
         test_trajectories_per_skill=4,
-        diayn=DiaynConfig(num_skills=2, diversity_weight=1.0, sac=_SAC),
+        diayn=DiaynConfig(num_skills=2, diversity_weight=10.0, diversity_floor=0.0, sac=_SAC),
     ),
 }
 

@@ -2,10 +2,13 @@
 
 import copy
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import mujoco
+from jax.flatten_util import ravel_pytree
 from mujoco import mjx
 
 from represent_jax.physics.engine import Engine, PhysicsState
@@ -25,7 +28,10 @@ class MjxSolver:
 
 
 class MjxEngine(Engine):
-    """Steps scenes with `mjx.step`, inside XLA."""
+    """Steps scenes with `mjx.step`, inside XLA.
+
+    A step can be differentiated in both modes, any number of solver iterations notwithstanding.
+    """
 
     name = "mjx"
 
@@ -46,6 +52,13 @@ class MjxEngine(Engine):
             self._template = mjx.make_data(model, impl="jax")
 
     def step(self, state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+        return _with_forward_jacobian(self._step)(state, ctrl)
+
+    def forward(self, state: PhysicsState, where: jax.Array) -> PhysicsState:
+        del where  # a masked lane costs the same under vmap
+        return _with_forward_jacobian(self._forward)(state)
+
+    def _step(self, state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         data = self._load(state).replace(ctrl=ctrl)
         data, _ = jax.lax.scan(
             lambda data, _: (mjx.step(self._mjx_model, data), None),
@@ -55,8 +68,7 @@ class MjxEngine(Engine):
         )
         return self._read(data)
 
-    def forward(self, state: PhysicsState, where: jax.Array) -> PhysicsState:
-        del where  # a masked lane costs the same under vmap
+    def _forward(self, state: PhysicsState) -> PhysicsState:
         result = self._read(mjx.forward(self._mjx_model, self._load(state)))
         return result.replace(qacc_warmstart=state.qacc_warmstart)
 
@@ -76,3 +88,23 @@ class MjxEngine(Engine):
             qacc_warmstart=data.qacc_warmstart,
             derived={name: jnp.asarray(getattr(data, name)) for name in self.derived_fields},
         )
+
+
+def _with_forward_jacobian(function: Callable) -> Callable:
+    """Makes a function differentiable in reverse that JAX can differentiate forward only.
+
+    The solver loops until it has converged, and such a loop has no transpose. The state is small,
+    so the whole Jacobian is computed forward; a product with it can then be transposed.
+    """
+    differentiable = jax.custom_jvp(function)
+
+    @differentiable.defjvp
+    def product(primals, tangents):
+        point, unravel = ravel_pytree(primals)
+        direction, _ = ravel_pytree(tangents)
+        along = functools.partial(jax.jvp, lambda x: function(*unravel(x)), (point,))
+        basis = jnp.eye(point.size, dtype=point.dtype)
+        value, jacobian = jax.vmap(lambda e: along((e,)), out_axes=(None, -1))(basis)
+        return value, jax.tree.map(lambda j: j @ direction, jacobian)
+
+    return differentiable

@@ -62,10 +62,10 @@ def imitation(results: Mapping[str, Any]) -> Verdict | None:
     shares = {target: share for target, share in shares.items() if math.isfinite(share)}
     sentences = {
         GOOD: "Yes: Phase 1 imitates every demonstrator.",
-        FAIR: "Nearly: at least one imitation falls a little short, so its noise curve starts below "
-        "the demonstrations.",
-        POOR: "No: at least one imitation stays far below its demonstrator. Its reward, and the noise "
-        "curve built on it, are not to be trusted; give Phase 1 more steps.",
+        FAIR: "Nearly: at least one imitation falls a little short, so its noise curve starts "
+        "below the demonstrations.",
+        POOR: "No: at least one imitation stays far below its demonstrator. Its reward, and the "
+        "noise curve built on it, are not to be trusted; give Phase 1 more steps.",
     }
     details = {
         t: f"{100 * share:.0f} % of the demonstrator's return" for t, share in shares.items()
@@ -127,8 +127,8 @@ def extrapolation(results: Mapping[str, Any]) -> Verdict | None:
         {
             GOOD: "Yes: among trajectories better than every demonstrator, the better one still "
             "gets the higher learned return. This is what lets a policy surpass them.",
-            FAIR: "Partly: above the demonstrators the order of at least one reward is only roughly "
-            "right.",
+            FAIR: "Partly: above the demonstrators at least one reward orders trajectories only "
+            "roughly.",
             POOR: "No: above the demonstrators at least one reward no longer tells better from "
             "worse, so its policy may stop improving there.",
         },

@@ -160,10 +160,10 @@ def _draw_noise_curve(ax: Axes, target: str, curve: Mapping[str, Any]) -> None:
         zorder=3,
     )
     if fitted.size and np.all(np.isfinite(fitted)):
-        label = "sigmoid" if falls else "isotonic fit, in place of a sigmoid"
+        label = "sigmoid" if falls else "isotonic fit: no sigmoid fits"
         ax.plot(*_dense(curve, levels, fitted, falls), color=colour(target), label=label)
     r2 = curve.get("r2")
-    quality = f"  $R^2$ = {r2:.2f}" if r2 is not None else ""
+    quality = f"  $R^2$ = {r2:.2f}" if falls and r2 is not None else ""
     ax.set_title(f"{display_name(target)}{quality}")
     ax.set_xlabel("noise level $\\eta$")
     ax.set_ylabel("return under the initial reward, scaled")

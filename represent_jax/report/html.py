@@ -86,7 +86,7 @@ def _page(
     env = results.get("env", config.get("env", "unknown environment"))
     body = [
         _header(env, config, results),
-        _unfinished(results),
+        _notices(results),
         _verdicts(diagnostics.verdicts(results, learning)),
         _table(tables.returns_table(results)),
         _gallery("Policies", drawn["learning"], _LEARNING_NOTE, "Learning curves"),
@@ -119,19 +119,26 @@ def _header(env: Any, config: Mapping[str, Any], results: Mapping[str, Any]) -> 
         if value is not None
     )
     return (
-        f"<header><p>REPRESENT: reward decomposition from suboptimal, heterogeneous "
-        f"demonstrations</p><h1>{_text(display_name(str(env)))}</h1><ul class=facts>{shown}</ul></header>"
+        "<header><p>REPRESENT: reward decomposition from suboptimal, heterogeneous "
+        f"demonstrations</p><h1>{_text(display_name(str(env)))}</h1>"
+        f"<ul class=facts>{shown}</ul></header>"
     )
 
 
-def _unfinished(results: Mapping[str, Any]) -> str:
+def _notices(results: Mapping[str, Any]) -> str:
+    notices = []
     missing = [name for stage, name in _STAGES.items() if not results.get(stage)]
-    if not missing:
-        return ""
-    return (
-        f"<p class=notice>This run is not finished: no results yet for {_text(', '.join(missing))}."
-        " The page shows what there is.</p>"
-    )
+    if missing:
+        notices.append(
+            f"This run is not finished: no results yet for {', '.join(missing)}. "
+            "The page shows what there is."
+        )
+    if results.get("strategies") == 1:
+        notices.append(
+            "The demonstrations hold one strategy alone: there is nothing to decompose, and task "
+            "and strategy reward may share what was learned in any way."
+        )
+    return "".join(f"<p class=notice>{_text(notice)}</p>" for notice in notices)
 
 
 def _verdicts(verdicts: Iterable[diagnostics.Verdict]) -> str:

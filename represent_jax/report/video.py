@@ -4,9 +4,12 @@ import contextlib
 import copy
 import importlib
 import os
+import shutil
+import subprocess
 import sys
+import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +38,11 @@ def render(
         path: the file; missing folders are made.
         fps: frames a second.
         camera: name or index of one of the model's cameras, -1 for the free camera.
-        size: width and height in pixels, multiples of 16.
+        size: width and height in pixels, even numbers.
 
     Raises:
-        RepresentError: the video packages or a GL library are missing, `qpos` does not fit the
-            model, or the file cannot be written.
+        RepresentError: ffmpeg or a GL library is missing, `qpos` does not fit the model, or the
+            file cannot be written.
         UsageError: the model has no such camera.
     """
     qpos = np.asarray(qpos, np.float64)
@@ -48,35 +51,57 @@ def render(
     if not np.all(np.isfinite(qpos)):
         raise RepresentError("video: qpos holds NaN or infinity")
     camera = _camera_id(model, camera)
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise RepresentError(
-            "videos need the extra packages: pip install 'represent_jax[video]'"
-        ) from error
-
+    ffmpeg = _ffmpeg()
     path = Path(path)
-    with contextlib.ExitStack() as stack:
-        draw = stack.enter_context(_renderer(model, size))
-        temporary = stack.enter_context(replacing(path))
-        writer = imageio_ffmpeg.write_frames(
-            str(temporary), size, fps=fps, codec="libx264", output_params=["-f", "mp4"]
-        )
-        stack.callback(writer.close)
-        writer.send(None)
-        data = mujoco.MjData(model)
-        for position in qpos:
-            data.qpos[:] = position
-            mujoco.mj_forward(model, data)
-            writer.send(draw(data, camera))
+    with _renderer(model, size) as draw, replacing(path) as temporary:
+        with _encoder(ffmpeg, temporary, fps, size) as send:
+            data = mujoco.MjData(model)
+            for position in qpos:
+                data.qpos[:] = position
+                mujoco.mj_forward(model, data)
+                send(draw(data, camera))
     return path
+
+
+def _ffmpeg() -> str:
+    """Returns the path of ffmpeg, that of imageio-ffmpeg or else the system's."""
+    with contextlib.suppress(ImportError, RuntimeError):
+        import imageio_ffmpeg
+
+        return imageio_ffmpeg.get_ffmpeg_exe()
+    found = shutil.which("ffmpeg")
+    if found is None:
+        raise RepresentError("videos need the extra packages: pip install 'represent_jax[video]'")
+    return found
+
+
+@contextlib.contextmanager
+def _encoder(
+    ffmpeg: str, path: Path, fps: float, size: tuple[int, int]
+) -> Iterator[Callable[[np.ndarray], None]]:
+    """Yields a function that adds a frame [height, width, 3] uint8 to an H.264 file."""
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}"]
+    coded = ["-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    command = [ffmpeg, "-y", "-loglevel", "error", *raw, "-i", "-", *coded, "-f", "mp4", str(path)]
+    # imageio-ffmpeg's own writer forks with a Python function, which JAX warns may deadlock.
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log)
+        try:
+            with contextlib.suppress(BrokenPipeError), process.stdin as pipe:
+                yield lambda frame: pipe.write(np.ascontiguousarray(frame).data)
+        finally:
+            status = process.wait()
+        if status:
+            log.seek(0)
+            reason = log.read().decode(errors="replace").strip().rpartition("\n")[2]
+            raise RepresentError(f"{path}: ffmpeg failed ({reason or f'exit status {status}'})")
 
 
 def _camera_id(model: mujoco.MjModel, camera: str | int) -> int:
     if isinstance(camera, str):
         names = [model.camera(i).name for i in range(model.ncam)]
         if camera not in names:
-            raise unknown("camera", camera, names)
+            raise unknown("camera", camera, names or ["-1 (free)"])
         return names.index(camera)
     if not -1 <= camera < model.ncam:
         raise unknown("camera", str(camera), [str(i) for i in range(-1, model.ncam)])
@@ -85,7 +110,7 @@ def _camera_id(model: mujoco.MjModel, camera: str | int) -> int:
 
 @contextlib.contextmanager
 def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> Iterator[Any]:
-    """Yields a function from (data, camera) to a frame [height, width, 3] uint8."""
+    """Yields a function from (data, camera) to a frame [height, width, 3], good until the next."""
     model = copy.copy(model)
     width, height = size
     model.vis.global_.offwidth, model.vis.global_.offheight = size
@@ -107,7 +132,7 @@ def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> Iterator[Any]:
             )
             mujoco.mjr_render(area, scene, context)
             mujoco.mjr_readPixels(frame, None, area, context)
-            return np.ascontiguousarray(frame[::-1])
+            return frame[::-1]
 
         yield draw
         context.free()

@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -159,3 +160,37 @@ def _versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return versions
+
+
+def append_results(
+    path: str | os.PathLike, method: str, config_hash: str, results: Mapping[str, Any]
+) -> None:
+    """Appends every figure of a run's results: demonstrators, rewards and policies.
+
+    Args:
+        path: the file.
+        method: name of the method.
+        config_hash: hash of the run's configuration.
+        results: what the method returned.
+    """
+    common = {
+        "domain": results["env"],
+        "method": method,
+        "seed": results["seed"],
+        "preset": results["preset"],
+        "backend": results["backend"],
+        "config_hash": config_hash,
+        "seconds": sum(results["seconds"].values()),
+        **provenance(),
+    }
+    figures = [
+        (f"strategy_{d['strategy'] + 1}", "demo_return", d["return_mean"])
+        for d in results["demonstrators"]
+    ]
+    for i, strategy in enumerate(results.get("airl", ())):
+        figures.append((f"strategy_{i + 1}", "airl_return", strategy["return"]))
+    for part in ("rewards", "policies"):
+        for target, quantities in results[part].items():
+            figures += [(target, name, value) for name, value in quantities.items()]
+    for target, quantity, value in figures:
+        append_record(path, target=target, quantity=quantity, value=value, **common)

@@ -392,36 +392,30 @@ def train(
     return state, jax.tree.map(jnp.mean, metrics)
 
 
-def select(rewards: Rewards, strategy: int | None) -> tuple[Params, ...]:
-    """Picks the heads whose sum is one target's reward.
-
-    Args:
-      rewards: all heads.
-      strategy: None for the task reward R^0, else the strategy i of R^i, counted from 0.
-
-    Returns:
-      The task head alone, or with one strategy's; leaves `[ensemble, ...]`.
-    """
-    if strategy is None:
-        return (rewards.task,)
-    return rewards.task, jax.tree.map(lambda leaf: leaf[:, strategy], rewards.strategies)
-
-
-def reward(
-    heads: tuple[Params, ...],
+def head_reward(
+    head: Params,
     obs_t: jax.Array,
     action_t: jax.Array,
     next_obs_t: jax.Array,
     config: RegressionConfig,
 ) -> jax.Array:
-    """R^0, or R^i = R^0 + alpha_i R~^i, the mean over the ensemble, `[...]`.
-
-    Args:
-      heads: what `select` returns.
-      obs_t, action_t, next_obs_t: `[..., dim]`.
-      config: settings.
-    """
+    """Reward of one head, R^0 or R~^i: the mean over its ensemble `[ensemble, ...]`, `[...]`."""
     inputs = inputs_of(obs_t, action_t, next_obs_t, config)
-    apply = jax.vmap(_head(config).apply, in_axes=(0, None))
-    values = [jnp.mean(apply(head, inputs), axis=0) for head in heads]
-    return values[0] + config.strategy_weight * sum(values[1:], jnp.zeros(()))
+    return jnp.mean(jax.vmap(_head(config).apply, in_axes=(0, None))(head, inputs), axis=0)
+
+
+def reward(
+    rewards: Rewards,
+    obs_t: jax.Array,
+    action_t: jax.Array,
+    next_obs_t: jax.Array,
+    config: RegressionConfig,
+    strategy: int | None = None,
+) -> jax.Array:
+    """R^0, or R^i = R^0 + alpha_i R~^i (Eq. 1) of one strategy counted from 0, `[...]`."""
+    task = head_reward(rewards.task, obs_t, action_t, next_obs_t, config)
+    if strategy is None:
+        return task
+    head = jax.tree.map(lambda leaf: leaf[:, strategy], rewards.strategies)
+    own = head_reward(head, obs_t, action_t, next_obs_t, config)
+    return task + config.strategy_weight * own

@@ -1,0 +1,73 @@
+"""Runs REPRESENT: from demonstrations to rewards, policies and a report.
+
+    python -m experiments.represent --env=half_cheetah --preset=quick --out=runs/demo
+    python -m experiments.represent --env=hopper --seed=1 --override policies.env_steps=200000
+"""
+
+import dataclasses
+import json
+
+from absl import flags
+
+from experiments import launch
+from represent_jax import config as configs
+from represent_jax.data.catalogue import load_demonstrations
+from represent_jax.envs import make_env
+from represent_jax.methods import represent
+from represent_jax.methods.presets import make_config
+from represent_jax.report import html, tables
+from represent_jax.runs import open_run
+from represent_jax.runs.records import append_results
+
+_ENV = flags.DEFINE_string("env", "half_cheetah", "Environment.")
+_PRESET = flags.DEFINE_string("preset", "quick", "Settings to begin with: smoke, quick or paper.")
+_SEED = flags.DEFINE_integer("seed", 0, "Seed of everything after the demonstrations.")
+_NUM_SEEDS = flags.DEFINE_integer("num_seeds", 1, "Number of seeds, from --seed on, in turn.")
+_BACKEND = flags.DEFINE_string("backend", "auto", "Physics engine: auto, mujoco or mjx.")
+_DEMONSTRATIONS = flags.DEFINE_string(
+    "demonstrations", "", "Name or npz file of demonstrations; the environment's own if empty."
+)
+_OUT = flags.DEFINE_string("out", None, "Run folder; runs/<env>-<preset>-<seed> if not given.")
+_OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting as dotted.key=value; repeatable.")
+_RESUME = flags.DEFINE_bool("resume", False, "Go on with the run in the folder.")
+_RECORD = flags.DEFINE_string("record", None, "File to append the results to, one JSON a line.")
+
+
+def main(argv: list[str]) -> None:
+    launch.refuse_arguments(argv)
+    for seed in range(_SEED.value, _SEED.value + _NUM_SEEDS.value):
+        config = dataclasses.replace(
+            make_config(_PRESET.value, _ENV.value),
+            seed=seed,
+            backend=_BACKEND.value,
+            demonstrations=_DEMONSTRATIONS.value,
+        )
+        config = configs.apply_overrides(config, _OVERRIDE.value)
+        out = _OUT.value or f"runs/{config.env}-{config.preset}-{seed}"
+        if _OUT.value and _NUM_SEEDS.value > 1:
+            out = f"{_OUT.value}/seed_{seed}"
+        _run(config, out)
+
+
+def _run(config: represent.RepresentConfig, out: str) -> None:
+    env = make_env(config.env, config.backend)
+    problem = represent.make_problem(
+        config,
+        env,
+        load_demonstrations(config.demonstrations or config.env),
+        load_demonstrations(f"{config.env}_test"),
+    )
+    print(json.dumps(configs.to_dict(config), indent=2))
+    if problem.demonstrations.num_strategies == 1:
+        print("one strategy alone: the rewards are learned, but nothing is decomposed")
+    with open_run(out, config, resume=_RESUME.value) as run:
+        results = represent.run(config, problem, run)
+        page = html.write_report(run.path)
+    print(tables.summary(results))
+    print(f"report: {page}")
+    if _RECORD.value:
+        append_results(_RECORD.value, "represent", configs.config_hash(config), results)
+
+
+if __name__ == "__main__":
+    launch.run(main)

@@ -1,0 +1,31 @@
+"""Demonstrations by name: those that ship with the package, or a file."""
+
+import os
+from importlib import resources
+from pathlib import Path
+
+from represent_jax.data.npz import load_demonstrations as load_file
+from represent_jax.data.trajectories import Demonstrations
+from represent_jax.errors import unknown
+
+
+def names() -> tuple[str, ...]:
+    """Returns the names of what ships with the package; a "_test" set goes with each domain."""
+    folder = resources.files("represent_jax.data.shipped")
+    return tuple(sorted(Path(f.name).stem for f in folder.iterdir() if f.name.endswith(".npz")))
+
+
+def load_demonstrations(name_or_path: str | os.PathLike) -> Demonstrations:
+    """Loads demonstrations by name, such as "half_cheetah", or from an npz file.
+
+    Raises:
+      UsageError: neither a name nor a file.
+      RepresentError: the file is not a whole file of demonstrations.
+    """
+    if str(name_or_path) in names():
+        folder = resources.files("represent_jax.data.shipped")
+        with resources.as_file(folder / f"{name_or_path}.npz") as path:
+            return load_file(path)
+    if not Path(name_or_path).exists():
+        raise unknown("demonstrations", str(name_or_path), names())
+    return load_file(name_or_path)

@@ -1,0 +1,1 @@
+"""Demonstrations and test trajectories that come with the package."""
