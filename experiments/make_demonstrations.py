@@ -39,7 +39,12 @@ def main(argv: list[str]) -> None:
 
 def _make_demonstrations(config: demonstrators.DemonstratorConfig, path: Path) -> None:
     snapshots = demonstrators.train(
-        config, config.seed, config.env_steps, config.trajectories_per_skill, _BACKEND.value
+        config,
+        config.seed,
+        config.env_steps,
+        config.trajectories_per_skill,
+        config.demonstration_horizon,
+        _BACKEND.value,
     )
     trajectories, env_steps = demonstrators.choose_demonstrations(
         snapshots, config.target_returns
@@ -64,7 +69,7 @@ def _make_test_set(config: demonstrators.DemonstratorConfig, path: Path) -> None
         config.test_seed,
         config.test_env_steps,
         config.test_trajectories_per_skill,
-        _BACKEND.value,
+        backend=_BACKEND.value,
     )
     trajectories = demonstrators.choose_test_set(
         snapshots, config.test_snapshots, config.test_trajectories_per_skill

@@ -418,6 +418,9 @@ def train(
 
 
 def population_axes(state: PpoState) -> PpoState:
-    """Returns vmap axes for a stacked state: 0 everywhere but for the shared counters."""
-    axes = jax.tree.map(lambda _: 0, state)
-    return axes.replace(env_steps=None, updates=None)
+    """Returns vmap axes for a stacked state: 0 everywhere but for the shared counters.
+
+    One number stands for a whole part of the state: Brax's observation counter would turn the
+    numbers of its own leaves into arrays, which vmap refuses.
+    """
+    return state.replace(learner=0, env_state=0, key=0, env_steps=None, updates=None)

@@ -44,7 +44,7 @@ def rollout(
         rows = (
             obs,
             jnp.where(keep, after.info["executed_action"], 0.0),
-            after.reward * running,
+            jnp.where(running > 0.0, after.reward, 0.0),
             running,
         )
         return (after.replace(obs=obs), running * (1.0 - after.done)), rows

@@ -151,9 +151,7 @@ def make_networks(obs_dim: int, action_dim: int, config: SacConfig) -> Networks:
     return Networks(networks, *losses, optax.adam(config.learning_rate))
 
 
-def init_learner(
-    key: jax.Array, obs_dim: int, action_dim: int, config: SacConfig
-) -> LearnerState:
+def init_learner(key: jax.Array, obs_dim: int, action_dim: int, config: SacConfig) -> LearnerState:
     """Draws fresh networks."""
     networks = make_networks(obs_dim, action_dim, config)
     key_policy, key_q = jax.random.split(key)
@@ -377,9 +375,7 @@ def update(
     return learner, metrics
 
 
-def learn(
-    state: SacState, batches: Transition, config: SacConfig
-) -> tuple[SacState, Metrics]:
+def learn(state: SacState, batches: Transition, config: SacConfig) -> tuple[SacState, Metrics]:
     """Makes one update for each batch, `[num_updates, batch_size]`, in order."""
     num_updates = batches.reward_t.shape[0]
     keys = jax.random.split(state.key, num_updates + 1)
@@ -397,9 +393,7 @@ def draw(state: SacState, env: Episode, config: SacConfig) -> tuple[SacState, Tr
     """Draws the batches of one step, `[updates_per_step, batch_size]`, from the buffer."""
     key_sample, key = jax.random.split(state.key)
     shape = (config.updates_per_step, config.batch_size)
-    batches = replay.sample(
-        state.buffer, key_sample, shape, env.observation_size, env.action_size
-    )
+    batches = replay.sample(state.buffer, key_sample, shape, env.observation_size, env.action_size)
     return state.replace(key=key), batches
 
 
@@ -452,8 +446,10 @@ def train(
 
 
 def population_axes(state: SacState) -> SacState:
-    """Returns vmap axes for a stacked state: 0 everywhere but for the shared counters."""
-    axes = jax.tree.map(lambda _: 0, state)
-    return axes.replace(
-        buffer=axes.buffer._replace(inserted=None), env_steps=None, updates=None
-    )
+    """Returns vmap axes for a stacked state: 0 everywhere but for the shared counters.
+
+    One number stands for a whole part of the state: Brax's observation counter would turn the
+    numbers of its own leaves into arrays, which vmap refuses.
+    """
+    buffer = replay.ReplayBuffer(data=0, inserted=None)
+    return state.replace(learner=0, buffer=buffer, env_state=0, key=0, env_steps=None, updates=None)

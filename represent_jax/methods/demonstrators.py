@@ -6,6 +6,7 @@ snapshots of another seed, evenly spread over training, so that returns go from 
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -37,6 +38,9 @@ class DemonstratorConfig:
       snapshot_env_steps: environment steps between two snapshots.
       target_returns: wanted mean true return of each skill.
       trajectories_per_skill: demonstrations of each skill.
+      demonstration_horizon: steps after which a demonstration is cut off; 0 is the environment's
+        own. Where the wanted episodes end early by themselves, a lower one saves rolling out
+        later skills in full at every snapshot.
       test_snapshots: snapshots in the test set, the untrained agent among them.
       test_trajectories_per_skill: test trajectories of each skill at each snapshot.
       diayn: the agent.
@@ -46,10 +50,11 @@ class DemonstratorConfig:
     seed: int = 0
     test_seed: int = 100
     env_steps: int = 480_000
-    test_env_steps: int = 640_000
+    test_env_steps: int = 480_000
     snapshot_env_steps: int = 8_000
     target_returns: tuple[float, ...] = (1243.13, 1172.71, 1181.35)
     trajectories_per_skill: int = 4
+    demonstration_horizon: int = 0
     test_snapshots: int = 18
     test_trajectories_per_skill: int = 2
     diayn: DiaynConfig = DiaynConfig(num_skills=3)
@@ -72,8 +77,8 @@ DEMONSTRATORS = {
     ),
     "hopper": DemonstratorConfig(
         env="hopper",
-        env_steps=960_000,
-        test_env_steps=1_280_000,
+        env_steps=1_280_000,
+        test_env_steps=960_000,
         snapshot_env_steps=16_000,
         target_returns=(1197.93, 1587.98),
         test_trajectories_per_skill=3,
@@ -81,13 +86,20 @@ DEMONSTRATORS = {
     ),
     "inverted_double_pendulum": DemonstratorConfig(
         env="inverted_double_pendulum",
-        env_steps=96_000,
-        test_env_steps=160_000,
+        env_steps=160_000,
+        test_env_steps=240_000,
         snapshot_env_steps=1_600,
         target_returns=(861.84, 1217.65),
-        trajectories_per_skill=40,
+        trajectories_per_skill=20,
+        demonstration_horizon=300,
         test_trajectories_per_skill=4,
-        diayn=DiaynConfig(num_skills=2, diversity_weight=10.0, diversity_floor=0.0, sac=_SAC),
+        # A floor of 0: negative rewards would make falling over attractive.
+        diayn=DiaynConfig(
+            num_skills=2,
+            diversity_weight=20.0,
+            diversity_floor=0.0,
+            sac=dataclasses.replace(_SAC, learning_rate=3e-4),
+        ),
     ),
 }
 
@@ -105,11 +117,16 @@ class Snapshot(NamedTuple):
 
 
 def train(
-    config: DemonstratorConfig, seed: int, env_steps: int, num_episodes: int, backend: str = "auto"
+    config: DemonstratorConfig,
+    seed: int,
+    env_steps: int,
+    num_episodes: int,
+    horizon: int = 0,
+    backend: str = "auto",
 ) -> list[Snapshot]:
     """Trains one DIAYN agent and rolls out every skill at every snapshot."""
     env = make_env(config.env, backend)
-    episodes, whole = Episode(env), Episode(env, auto_reset=False)
+    episodes, whole = Episode(env), Episode(env, horizon or env.horizon, auto_reset=False)
     diayn_config = config.diayn
     key_init, key_rollout = jax.random.split(jax.random.PRNGKey(seed))
     state = jax.jit(lambda key: diayn.init(key, episodes, diayn_config))(key_init)
@@ -163,18 +180,28 @@ def _returns(batch: TrajectoryBatch) -> np.ndarray:
 def choose_demonstrations(
     snapshots: Sequence[Snapshot], target_returns: Sequence[float]
 ) -> tuple[list[Trajectory], list[int]]:
-    """Takes each skill's demonstrations from the snapshot nearest to its target return.
+    """Takes the demonstrations of each target return from the snapshot and skill nearest to it.
+
+    Skills learn at different speeds, so they are first dealt out to the targets such that the
+    relative errors are least in sum. Strategy i is the skill that serves target i.
 
     Returns:
-      Trajectories of all skills, and the environment steps of each skill's snapshot.
+      Trajectories of all strategies, and the environment steps of each strategy's snapshot.
     """
+    targets = np.asarray(target_returns)
     returns = np.stack([_returns(s.trajectories).mean(axis=-1) for s in snapshots])
-    chosen = np.argmin(np.abs(returns - np.asarray(target_returns)), axis=0)
-    trajectories = []
-    for skill, index in enumerate(chosen):
-        batch = jax.tree.map(lambda x, skill=skill: x[skill], snapshots[index].trajectories)
-        trajectories += unpad(batch._replace(strategy=np.full_like(batch.strategy, skill)))
-    return trajectories, [snapshots[index].env_steps for index in chosen]
+    error = np.abs(returns[:, :, None] / targets - 1.0)  # [snapshot, skill, target]
+    order = min(
+        itertools.permutations(range(len(targets))),
+        key=lambda skills: sum(error[:, skill, i].min() for i, skill in enumerate(skills)),
+    )
+    trajectories, env_steps = [], []
+    for strategy, skill in enumerate(order):
+        snapshot = snapshots[int(np.argmin(error[:, skill, strategy]))]
+        batch = jax.tree.map(lambda x, skill=skill: x[skill], snapshot.trajectories)
+        trajectories += unpad(batch._replace(strategy=np.full_like(batch.strategy, strategy)))
+        env_steps.append(snapshot.env_steps)
+    return trajectories, env_steps
 
 
 def choose_test_set(

@@ -87,7 +87,8 @@ class Population:
         if self.mode == "threads":
             return list(states)
         leaves, structure = jax.tree.flatten(states)
-        axes = jax.tree.leaves(self._axes_of(states), is_leaf=lambda axis: axis is None)
+        axes = jax.tree.broadcast(self._axes_of(states), states, is_leaf=lambda axis: axis is None)
+        axes = jax.tree.leaves(axes, is_leaf=lambda axis: axis is None)
         return [
             structure.unflatten(
                 [leaf if axis is None else leaf[i] for leaf, axis in zip(leaves, axes, strict=True)]

@@ -39,7 +39,7 @@ class MujocoEngine(Engine):
         num_threads: int | None = None,
     ):
         super().__init__(model, frame_skip, derived_fields)
-        self._num_threads = num_threads or len(os.sched_getaffinity(0))
+        self.num_threads = num_threads or len(os.sched_getaffinity(0))
         self._idle: dict[int, list[_Lane]] = collections.defaultdict(list)
         self._lock = threading.Lock()
         template = mujoco.MjData(model)
@@ -98,7 +98,7 @@ class MujocoEngine(Engine):
             idle = self._idle[num_scenes]
             lane = idle.pop() if idle else None
         if lane is None:
-            num_threads = min(self._num_threads, num_scenes)
+            num_threads = min(self.num_threads, num_scenes)
             batch = mujoco_batch.Batch(self.model, num_scenes, num_threads)
             lane = _Lane(batch, tuple(self._shapes))
         try:

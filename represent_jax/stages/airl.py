@@ -45,8 +45,9 @@ class AirlConfig:
       updates_per_step: discriminator updates after each vectorised step.
       gradient_penalty: weight of the squared gradient norm of f between demonstration and replay.
       shaping_discount: gamma in f.
-      reward_scale: factor on the logits that reward the generator.
-      reward_clip: bound on the logits that reward the generator.
+      log_prob_clip: bound on log pi in the logits.
+      reward_scale: factor on f where it rewards the generator.
+      reward_clip: bound on f where it rewards the generator.
       sac: the generator.
     """
 
@@ -60,6 +61,7 @@ class AirlConfig:
     updates_per_step: int = 4
     gradient_penalty: float = 1.0
     shaping_discount: float = 0.99
+    log_prob_clip: float = 5.0
     reward_scale: float = 0.5
     reward_clip: float = 10.0
     sac: SacConfig = SacConfig()
@@ -282,8 +284,7 @@ def step(
     )
 
     agent, batches = sac.draw(agent, env, config.sac)
-    logits = advantage(params, batches, config) - _log_prob(policy, batches, config)
-    reward_t = config.reward_scale * jnp.clip(logits, -config.reward_clip, config.reward_clip)
+    reward_t = generator_reward(params, batches, config)
     agent, metrics = sac.learn(agent, batches._replace(reward_t=reward_t), config.sac)
     metrics = {
         **metrics,
@@ -294,8 +295,21 @@ def step(
 
 
 def _log_prob(policy: sac.PolicyParams, rows: Transition, config: AirlConfig) -> jax.Array:
-    # Saturated actions have densities of any size; the bound keeps logits finite.
-    return jnp.clip(sac.log_prob(policy, rows.obs_t, rows.action_t, config.sac), -20.0, 20.0)
+    # Saturated actions have densities of any size, which would drown what f has to say.
+    log_prob_t = sac.log_prob(policy, rows.obs_t, rows.action_t, config.sac)
+    return jnp.clip(log_prob_t, -config.log_prob_clip, config.log_prob_clip)
+
+
+def generator_reward(
+    params: RewardParams, transition: Transition, config: AirlConfig
+) -> jax.Array:
+    """What the generator maximises beside its own entropy, `[...]`.
+
+    AIRL's reward is f - log pi. Its second half is the entropy that SAC adds by itself; written
+    into the rewards of replayed actions it would favour those the policy has left behind.
+    """
+    f_t = advantage(params, transition, config)
+    return config.reward_scale * jnp.clip(f_t, -config.reward_clip, config.reward_clip)
 
 
 def train(

@@ -81,29 +81,38 @@ def log_posterior(classifier: StyleClassifier, obs: jax.Array) -> jax.Array:
     )
 
 
-def pairwise_accuracy(trajectories: Sequence[Trajectory]) -> dict[str, float]:
-    """Held-out accuracy on single states of every pair of strategies, such as `{"1-2": 0.97}`.
+def pairwise_accuracy(trajectories: Sequence[Trajectory]) -> dict[str, dict[str, float]]:
+    """Held-out accuracy with which every pair of strategies is told apart.
 
     Half of each strategy's trajectories is fitted to, the other half judged; both ways round.
+
+    Returns:
+      For every pair, such as "1-2": accuracy on single "states" and on whole "trajectories",
+      which are judged by their states' mean log posterior.
     """
     num_strategies = 1 + max(t.strategy for t in trajectories)
     fit_pair = jax.jit(fit, static_argnums=3)
     result = {}
     for pair in itertools.combinations(range(num_strategies), 2):
-        scores = []
+        states, wholes = [], []
         for parity in (0, 1):
-            fitted = [_states(trajectories, s, parity) for s in pair]
+            fitted = [
+                np.concatenate([t.obs[1:] for t in _own(trajectories, strategy)[parity::2]])
+                for strategy in pair
+            ]
             labels = np.repeat(np.arange(2), [len(obs) for obs in fitted])
-            key = jax.random.PRNGKey(parity)
-            classifier = fit_pair(key, np.concatenate(fitted), labels, 2)
+            classifier = fit_pair(jax.random.PRNGKey(parity), np.concatenate(fitted), labels, 2)
             for label, strategy in enumerate(pair):
-                held_out = _states(trajectories, strategy, 1 - parity)
-                guess = jnp.argmax(log_posterior(classifier, held_out), axis=-1)
-                scores.append(float(jnp.mean(guess == label)))
-        result[f"{pair[0] + 1}-{pair[1] + 1}"] = round(float(np.mean(scores)), 4)
+                for t in _own(trajectories, strategy)[1 - parity :: 2]:
+                    posterior = np.asarray(log_posterior(classifier, t.obs[1:]))
+                    states.append(np.mean(np.argmax(posterior, axis=-1) == label))
+                    wholes.append(np.argmax(np.mean(posterior, axis=0)) == label)
+        result[f"{pair[0] + 1}-{pair[1] + 1}"] = {
+            "states": round(float(np.mean(states)), 4),
+            "trajectories": round(float(np.mean(wholes)), 4),
+        }
     return result
 
 
-def _states(trajectories: Sequence[Trajectory], strategy: int, parity: int) -> np.ndarray:
-    own = [t for t in trajectories if t.strategy == strategy]
-    return np.concatenate([t.obs[1:] for t in own[parity::2]])
+def _own(trajectories: Sequence[Trajectory], strategy: int) -> list[Trajectory]:
+    return [t for t in trajectories if t.strategy == strategy]

@@ -8,10 +8,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs import base
+
+from represent_jax.envs.episode import Episode
 
 DISCOUNT = 0.8
 HORIZON = 2
+NEVER = 1_000
 
 
 class Probe(NamedTuple):
@@ -19,11 +23,12 @@ class Probe(NamedTuple):
 
     The observation is a position x. A step pays
 
-      constant + slope * x - (a - target * (x if `target_follows_x` else 1))^2 * penalty
+      constant + slope * x - penalty * (a - target)^2
 
-    and moves x up by `drift`, to at most 1.
+    with the target at x / 2 or at 1 / 2, and moves x up by `drift`, to at most 1.
 
     Attributes:
+      target_follows_x: whether the best action is x / 2.
       random_start: whether an episode starts at -1 or 1, each as likely; else at 0.
       lifetime: steps after which an episode terminates.
     """
@@ -31,14 +36,12 @@ class Probe(NamedTuple):
     constant: float = 0.0
     slope: float = 0.0
     penalty: float = 0.0
-    target: float = 0.5
     target_follows_x: bool = False
     drift: float = 0.0
     random_start: bool = False
     lifetime: int = 1
 
 
-NEVER = 1_000
 PROBES = {
     "constant": Probe(constant=1.0),
     "observed": Probe(slope=1.0, random_start=True),
@@ -47,6 +50,9 @@ PROBES = {
     "action": Probe(constant=1.0, penalty=1.0),
     "action_observed": Probe(constant=1.0, penalty=1.0, target_follows_x=True, random_start=True),
 }
+
+# Every episode is 0, 1, 1 and cut off there; rewards depend on actions.
+WORLD = Probe(slope=1.0, penalty=1.0, drift=1.0, lifetime=NEVER)
 
 # Of the best policy: (probe, x, V(x)). Only true final observations give those of "endless": its
 # episodes are cut off after the first step at x = 1, and the next one starts at x = 0.
@@ -71,16 +77,11 @@ ACTIONS = [
 ]
 
 
-def stack(probes) -> Probe:
-    """Puts probes into one population."""
-    return jax.tree.map(lambda *leaves: jnp.asarray(leaves), *probes)
-
-
-def reward(probe: Probe, obs_t: jax.Array, action_t: jax.Array, next_obs_t: jax.Array):
+def reward(probe: Probe, obs_t: jax.Array, action_t: jax.Array, next_obs_t: jax.Array) -> jax.Array:
     """What a step pays, as a RewardFn whose parameters are the probe, `[...]`."""
     del next_obs_t
     x, a = obs_t[..., 0], action_t[..., 0]
-    target = probe.target * jnp.where(probe.target_follows_x, x, 1.0)
+    target = 0.5 * jnp.where(probe.target_follows_x, x, 1.0)
     return probe.constant + probe.slope * x - probe.penalty * jnp.square(a - target)
 
 
@@ -89,7 +90,7 @@ class ProbeEnv(base.Env):
 
     Attributes:
       probe: the probe; its fields may be traced.
-      num_traces: how often `step` was traced (or called).
+      num_traces: how often `step` was called, which is how often it was traced under jit.
     """
 
     observation_size = 1
@@ -118,3 +119,39 @@ class ProbeEnv(base.Env):
             reward=reward(self.probe, state.obs, action, next_obs),
             done=(age >= self.probe.lifetime).astype(jnp.float32),
         )
+
+
+def episode(probe: Probe = WORLD, auto_reset: bool = True) -> Episode:
+    """Makes episodes of one probe."""
+    return Episode(ProbeEnv(probe), auto_reset=auto_reset)
+
+
+def train_all(agent, config, num_steps: int, key: jax.Array) -> dict:
+    """Trains an agent on every probe, as one population, and returns the learners by name."""
+
+    def member(probe, key):
+        env = episode(probe)
+        state, _ = agent.train(agent.init(key, env, config), env, config, num_steps)
+        return state.learner
+
+    population = jax.tree.map(lambda *leaves: jnp.asarray(leaves), *PROBES.values())
+    learners = jax.jit(jax.vmap(member))(population, jax.random.split(key, len(PROBES)))
+    return {name: take(learners, i) for i, name in enumerate(PROBES)}
+
+
+def take(tree, i: int):
+    """Reads one member of a population."""
+    return jax.tree.map(lambda leaf: leaf[i], tree)
+
+
+def assert_equal(actual, expected) -> None:
+    """Asserts that two pytrees are the same, bit for bit."""
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    jax.tree.map(np.testing.assert_array_equal, actual, expected)
+
+
+def assert_close(actual, expected, tolerance: float = 1e-5) -> None:
+    """Asserts that two pytrees are the same up to rounding."""
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)

@@ -58,9 +58,7 @@ def gym_steps(name):
         if i in (0, NUM_STEPS // 2):
             env.reset(seed=i)
         data = env.data
-        qpos, qvel, warmstart = (
-            np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)
-        )
+        qpos, qvel, warmstart = (np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart))
         env.set_state(qpos, qvel)
         data.qacc_warmstart[:] = warmstart
         action = rng.uniform(-1.0, 1.0, env.model.nu).astype(np.float32)
