@@ -1,6 +1,6 @@
 """Makes the demonstrations and test trajectories that ship with the package.
 
-    python -m experiments.make_demonstrations --env=half_cheetah --out=represent_jax/data/shipped
+python -m experiments.make_demonstrations --env=half_cheetah --out=represent_jax/data/shipped
 """
 
 import os
@@ -42,12 +42,13 @@ def _make_demonstrations(config: demonstrators.DemonstratorConfig, path: Path) -
         config,
         config.seed,
         config.env_steps,
+        config.snapshot_env_steps,
         config.trajectories_per_skill,
         config.demonstration_horizon,
         _BACKEND.value,
     )
     trajectories, env_steps = demonstrators.choose_demonstrations(
-        snapshots, config.target_returns
+        snapshots, config.target_returns, config.min_skill_accuracy
     )
     accuracy = style.pairwise_accuracy(trajectories)
     metadata = {
@@ -68,6 +69,7 @@ def _make_test_set(config: demonstrators.DemonstratorConfig, path: Path) -> None
         config,
         config.test_seed,
         config.test_env_steps,
+        config.test_env_steps // (config.test_snapshots - 1),
         config.test_trajectories_per_skill,
         backend=_BACKEND.value,
     )
@@ -81,7 +83,9 @@ def _make_test_set(config: demonstrators.DemonstratorConfig, path: Path) -> None
     data = Demonstrations(config.env, tuple(trajectories), metadata)
     save_demonstrations(path, data)
     returns = sorted(t.total_reward for t in trajectories)
-    print(f"{len(returns)} test trajectories, returns {returns[0]:.0f} to {returns[-1]:.0f}: {path}")
+    print(
+        f"{len(returns)} test trajectories, returns {returns[0]:.0f} to {returns[-1]:.0f}: {path}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Runs REPRESENT: from demonstrations to rewards, policies and a report.
 
-    python -m experiments.represent --env=half_cheetah --preset=quick --out=runs/demo
-    python -m experiments.represent --env=hopper --seed=1 --override policies.env_steps=200000
+python -m experiments.represent --env=half_cheetah --preset=quick --out=runs/demo
+python -m experiments.represent --env=hopper --seed=1 --override policies.env_steps=200000
 """
 
 import dataclasses
@@ -14,6 +14,7 @@ from represent_jax import config as configs
 from represent_jax.data.catalogue import load_demonstrations
 from represent_jax.envs import make_env
 from represent_jax.methods import represent
+from represent_jax.methods.config import RepresentConfig, make_problem
 from represent_jax.methods.presets import make_config
 from represent_jax.report import html, tables
 from represent_jax.runs import open_run
@@ -30,6 +31,9 @@ _DEMONSTRATIONS = flags.DEFINE_string(
 _OUT = flags.DEFINE_string("out", None, "Run folder; runs/<env>-<preset>-<seed> if not given.")
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting as dotted.key=value; repeatable.")
 _RESUME = flags.DEFINE_bool("resume", False, "Go on with the run in the folder.")
+_CHECKPOINT_SECONDS = flags.DEFINE_float(
+    "checkpoint_seconds", 60.0, "Least time between two checkpoints of a stage."
+)
 _RECORD = flags.DEFINE_string("record", None, "File to append the results to, one JSON a line.")
 
 
@@ -49,9 +53,9 @@ def main(argv: list[str]) -> None:
         _run(config, out)
 
 
-def _run(config: represent.RepresentConfig, out: str) -> None:
+def _run(config: RepresentConfig, out: str) -> None:
     env = make_env(config.env, config.backend)
-    problem = represent.make_problem(
+    problem = make_problem(
         config,
         env,
         load_demonstrations(config.demonstrations or config.env),
@@ -61,7 +65,7 @@ def _run(config: represent.RepresentConfig, out: str) -> None:
     if problem.demonstrations.num_strategies == 1:
         print("one strategy alone: the rewards are learned, but nothing is decomposed")
     with open_run(out, config, resume=_RESUME.value) as run:
-        results = represent.run(config, problem, run)
+        results = represent.run(config, problem, run, _CHECKPOINT_SECONDS.value)
         page = html.write_report(run.path)
     print(tables.summary(results))
     print(f"report: {page}")

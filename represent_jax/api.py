@@ -10,7 +10,7 @@ from represent_jax import config as configs
 from represent_jax.agents import sac
 from represent_jax.envs import make_env
 from represent_jax.errors import RepresentError, unknown
-from represent_jax.methods.represent import RepresentConfig, target_names
+from represent_jax.methods.config import RepresentConfig, target_names
 from represent_jax.runs import RunDirectory, load_config_json
 from represent_jax.stages import regression
 

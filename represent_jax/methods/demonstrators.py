@@ -20,6 +20,7 @@ from represent_jax.agents.sac import SacConfig
 from represent_jax.config import require
 from represent_jax.data.trajectories import Trajectory, TrajectoryBatch, unpad
 from represent_jax.envs import Episode, make_env
+from represent_jax.errors import RepresentError
 from represent_jax.runs.loop import advance
 from represent_jax.stages import diayn
 from represent_jax.stages.diayn import DiaynConfig
@@ -35,12 +36,14 @@ class DemonstratorConfig:
       test_seed: seed of the agent whose snapshots become the test set.
       env_steps: training budget of the demonstrators.
       test_env_steps: training budget of the test set's agent.
-      snapshot_env_steps: environment steps between two snapshots.
+      snapshot_env_steps: environment steps between two snapshots of the demonstrators.
       target_returns: wanted mean true return of each skill.
       trajectories_per_skill: demonstrations of each skill.
       demonstration_horizon: steps after which a demonstration is cut off; 0 is the environment's
         own. Where the wanted episodes end early by themselves, a lower one saves rolling out
         later skills in full at every snapshot.
+      min_skill_accuracy: share of its states by which DIAYN's discriminator must know a skill
+        before it can demonstrate.
       test_snapshots: snapshots in the test set, the untrained agent among them.
       test_trajectories_per_skill: test trajectories of each skill at each snapshot.
       diayn: the agent.
@@ -55,6 +58,7 @@ class DemonstratorConfig:
     target_returns: tuple[float, ...] = (1243.13, 1172.71, 1181.35)
     trajectories_per_skill: int = 4
     demonstration_horizon: int = 0
+    min_skill_accuracy: float = 0.9
     test_snapshots: int = 18
     test_trajectories_per_skill: int = 2
     diayn: DiaynConfig = DiaynConfig(num_skills=3)
@@ -73,7 +77,18 @@ _SAC = SacConfig(initial_temperature=0.1, learning_rate=1e-3)
 
 DEMONSTRATORS = {
     "half_cheetah": DemonstratorConfig(
-        diayn=DiaynConfig(num_skills=3, diversity_weight=2.0, sac=_SAC),
+        seed=1,
+        test_seed=101,
+        env_steps=240_000,
+        test_env_steps=480_000,
+        snapshot_env_steps=4_000,
+        diayn=DiaynConfig(
+            num_skills=3,
+            diversity_weight=2.0,
+            # Joint angles: styles then are gaits, not running on the back.
+            discriminator_obs=(2, 3, 4, 5, 6, 7),
+            sac=dataclasses.replace(_SAC, initial_temperature=1.0),
+        ),
     ),
     "hopper": DemonstratorConfig(
         env="hopper",
@@ -87,10 +102,11 @@ DEMONSTRATORS = {
     "inverted_double_pendulum": DemonstratorConfig(
         env="inverted_double_pendulum",
         env_steps=160_000,
-        test_env_steps=240_000,
+        test_env_steps=120_000,
         snapshot_env_steps=1_600,
         target_returns=(861.84, 1217.65),
         trajectories_per_skill=20,
+        min_skill_accuracy=0.8,
         demonstration_horizon=300,
         test_trajectories_per_skill=4,
         # A floor of 0: negative rewards would make falling over attractive.
@@ -110,16 +126,19 @@ class Snapshot(NamedTuple):
     Attributes:
       env_steps: environment steps trained so far.
       trajectories: `[num_skills, num_episodes]`.
+      accuracy: share of states by which the discriminator knows each skill, `[num_skills]`.
     """
 
     env_steps: int
     trajectories: TrajectoryBatch
+    accuracy: np.ndarray
 
 
 def train(
     config: DemonstratorConfig,
     seed: int,
     env_steps: int,
+    snapshot_env_steps: int,
     num_episodes: int,
     horizon: int = 0,
     backend: str = "auto",
@@ -130,18 +149,22 @@ def train(
     diayn_config = config.diayn
     key_init, key_rollout = jax.random.split(jax.random.PRNGKey(seed))
     state = jax.jit(lambda key: diayn.init(key, episodes, diayn_config))(key_init)
-    steps = config.snapshot_env_steps // diayn_config.sac.num_envs
+    steps = max(1, snapshot_env_steps // diayn_config.sac.num_envs)
+    snapshot_env_steps = steps * diayn_config.sac.num_envs
     train_steps = jax.jit(
         lambda state: diayn.train(state, episodes, diayn_config, steps), donate_argnums=0
     )
 
     @jax.jit
-    def roll(params, key):
+    def roll(params, discriminator, key):
         def one_skill(key, skill):
             def policy(params, obs_t, key):
                 return diayn.act(params, skill, obs_t, key, diayn_config, env.action_size)
 
-            return rollout(whole, policy, params, key, jnp.zeros(num_episodes))
+            batch = rollout(whole, policy, params, key, jnp.zeros(num_episodes))
+            posterior = diayn.log_skill_posterior(discriminator, batch.obs[:, 1:], diayn_config)
+            known = (jnp.argmax(posterior, axis=-1) == skill) * batch.mask
+            return batch, jnp.sum(known) / jnp.sum(batch.mask)
 
         skills = jnp.arange(diayn_config.num_skills)
         return jax.vmap(one_skill)(jax.random.split(key, skills.size), skills)
@@ -150,15 +173,16 @@ def train(
 
     def snap(state) -> Snapshot:
         key = jax.random.fold_in(key_rollout, len(snapshots))
-        batch = jax.device_get(roll(sac.policy_of(state.sac.learner), key))
-        snapshots.append(Snapshot(int(state.sac.env_steps), batch))
+        policy = sac.policy_of(state.sac.learner)
+        batch, accuracy = jax.device_get(roll(policy, state.discriminator, key))
+        snapshots.append(Snapshot(int(state.sac.env_steps), batch, accuracy))
         return snapshots[-1]
 
     def chunk(state):
-        state, metrics = train_steps(state)
-        returns = _returns(snap(state).trajectories).mean(axis=1)
-        skills = {f"return_{i}": value for i, value in enumerate(returns)}
-        return state, {**skills, "accuracy": metrics["discriminator_accuracy"]}
+        state, _ = train_steps(state)
+        snapshot = snap(state)
+        returns = _returns(snapshot.trajectories).mean(axis=1)
+        return state, {"returns": returns, "accuracy": snapshot.accuracy}
 
     snap(state)
     advance(
@@ -166,9 +190,9 @@ def train(
         f"{config.env} seed {seed}",
         state,
         chunk,
-        env_steps // config.snapshot_env_steps,
-        units_per_chunk=config.snapshot_env_steps,
-        describe=lambda m: " ".join(f"{float(v):.4g}" for v in m.values()),
+        env_steps // snapshot_env_steps,
+        units_per_chunk=snapshot_env_steps,
+        describe=lambda m: f"returns {m['returns'].round()}, known by {m['accuracy'].round(2)}",
     )
     return snapshots
 
@@ -178,19 +202,31 @@ def _returns(batch: TrajectoryBatch) -> np.ndarray:
 
 
 def choose_demonstrations(
-    snapshots: Sequence[Snapshot], target_returns: Sequence[float]
+    snapshots: Sequence[Snapshot],
+    target_returns: Sequence[float],
+    min_skill_accuracy: float = 0.0,
 ) -> tuple[list[Trajectory], list[int]]:
     """Takes the demonstrations of each target return from the snapshot and skill nearest to it.
 
     Skills learn at different speeds, so they are first dealt out to the targets such that the
     relative errors are least in sum. Strategy i is the skill that serves target i.
 
+    Raises:
+      RepresentError: a skill is never known well enough.
+
     Returns:
       Trajectories of all strategies, and the environment steps of each strategy's snapshot.
     """
     targets = np.asarray(target_returns)
     returns = np.stack([_returns(s.trajectories).mean(axis=-1) for s in snapshots])
+    known = np.stack([s.accuracy for s in snapshots]) >= min_skill_accuracy
+    if not known.any(axis=0).all():
+        raise RepresentError(
+            f"skills {np.flatnonzero(~known.any(axis=0)).tolist()} are never known by "
+            f"{min_skill_accuracy:.0%} of their states: train longer or raise diversity_weight"
+        )
     error = np.abs(returns[:, :, None] / targets - 1.0)  # [snapshot, skill, target]
+    error = np.where(known[:, :, None], error, np.inf)
     order = min(
         itertools.permutations(range(len(targets))),
         key=lambda skills: sum(error[:, skill, i].min() for i, skill in enumerate(skills)),

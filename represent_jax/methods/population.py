@@ -27,7 +27,7 @@ class Population:
       mode: "threads" or "vmap".
     """
 
-    def __init__(self, inputs: Sequence[Any], mode: str = "auto", axes_of: Callable = None):
+    def __init__(self, inputs: Sequence[Any], mode: str = "auto", axes_of: Callable | None = None):
         """Gathers the members.
 
         Args:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from represent_jax.agents.sac import SacConfig
 from represent_jax.errors import unknown
-from represent_jax.methods.represent import RepresentConfig
+from represent_jax.methods.config import RepresentConfig
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.noise import NoiseConfig
 from represent_jax.stages.policies import PoliciesConfig

@@ -49,7 +49,9 @@ class Engine(abc.ABC):
         """Seconds of simulated time in one environment step."""
         return float(self.model.opt.timestep * self.frame_skip)
 
-    def init(self, qpos: jax.Array, qvel: jax.Array, where: jax.Array | bool = True) -> PhysicsState:
+    def init(
+        self, qpos: jax.Array, qvel: jax.Array, where: jax.Array | bool = True
+    ) -> PhysicsState:
         """Returns the state at rest in the solver at the given positions and velocities.
 
         Args:

@@ -51,7 +51,7 @@ class AirlConfig:
       sac: the generator.
     """
 
-    env_steps: int = 160_000
+    env_steps: int = 240_000
     noisy: bool = True
     state_only: bool = True
     hidden_sizes: tuple[int, ...] = (64, 64)
@@ -61,10 +61,10 @@ class AirlConfig:
     updates_per_step: int = 4
     gradient_penalty: float = 1.0
     shaping_discount: float = 0.99
-    log_prob_clip: float = 5.0
+    log_prob_clip: float = 1.0
     reward_scale: float = 0.5
     reward_clip: float = 10.0
-    sac: SacConfig = SacConfig()
+    sac: SacConfig = SacConfig(buffer_capacity=256_000, initial_temperature=0.1, learning_rate=1e-3)
 
     def __post_init__(self) -> None:
         for field in ("env_steps", "batch_size", "updates_per_step"):
@@ -295,14 +295,13 @@ def step(
 
 
 def _log_prob(policy: sac.PolicyParams, rows: Transition, config: AirlConfig) -> jax.Array:
-    # Saturated actions have densities of any size, which would drown what f has to say.
+    # Unbounded, log pi alone tells old and demonstrated actions from fresh ones, and a state-only
+    # f is left with nothing to learn from; see BUILD_NOTES.
     log_prob_t = sac.log_prob(policy, rows.obs_t, rows.action_t, config.sac)
     return jnp.clip(log_prob_t, -config.log_prob_clip, config.log_prob_clip)
 
 
-def generator_reward(
-    params: RewardParams, transition: Transition, config: AirlConfig
-) -> jax.Array:
+def generator_reward(params: RewardParams, transition: Transition, config: AirlConfig) -> jax.Array:
     """What the generator maximises beside its own entropy, `[...]`.
 
     AIRL's reward is f - log pi. Its second half is the entropy that SAC adds by itself; written

@@ -32,6 +32,8 @@ class DiaynConfig:
     Attributes:
       num_skills: number of skills; each becomes one demonstrator.
       diversity_weight: beta, the weight of the diversity reward beside the environment's.
+      discriminator_obs: indices of the observation that q sees, all if empty. A prior on what
+        makes a style (DIAYN, section 3.2): gaits then differ, rather than which side is up.
       diversity_floor: lower bound of log q - log p, which is unbounded below.
       discriminator_hidden_sizes: units of the discriminator's hidden layers.
       discriminator_learning_rate: its Adam step size.
@@ -40,6 +42,7 @@ class DiaynConfig:
 
     num_skills: int = 2
     diversity_weight: float = 1.0
+    discriminator_obs: tuple[int, ...] = ()
     diversity_floor: float = -5.0
     discriminator_hidden_sizes: tuple[int, ...] = (128, 128)
     discriminator_learning_rate: float = 3e-4
@@ -87,14 +90,20 @@ def init(key: jax.Array, env: Episode, config: DiaynConfig) -> DiaynState:
     start = jax.vmap(conditioned.reset)(jax.random.split(key_reset, skills.size), skills)
     agent = sac.init(key_sac, conditioned, config.sac, start)
     module, optimizer = _discriminator(env.observation_size, config)
-    params = module.init(key_discriminator, jnp.zeros(env.observation_size))
+    params = module.init(key_discriminator, _seen(jnp.zeros(env.observation_size), config))
     return DiaynState(agent, params, optimizer.init(params))
 
 
 def log_skill_posterior(params: Params, obs_t: jax.Array, config: DiaynConfig) -> jax.Array:
     """Log q(z|s), `[..., num_skills]`, of observations without the skill, `[..., obs_dim]`."""
     module, _ = _discriminator(obs_t.shape[-1], config)
-    return jax.nn.log_softmax(module.apply(params, obs_t))
+    return jax.nn.log_softmax(module.apply(params, _seen(obs_t, config)))
+
+
+def _seen(obs_t: jax.Array, config: DiaynConfig) -> jax.Array:
+    if not config.discriminator_obs:
+        return obs_t
+    return obs_t[..., jnp.asarray(config.discriminator_obs)]
 
 
 def diversity_reward(log_posterior: jax.Array, skill: jax.Array, floor: float) -> jax.Array:

@@ -40,7 +40,7 @@ class PoliciesConfig:
     center: float = 1.0
     eval_env_steps: int = 20_000
     eval_episodes: int = 5
-    sac: SacConfig = SacConfig(initial_temperature=0.05)
+    sac: SacConfig = SacConfig(initial_temperature=0.05, learning_rate=1e-3)
 
     def __post_init__(self) -> None:
         require(self.start in ("phase1", "cold"), "start", "'phase1' or 'cold'", self.start)
@@ -104,7 +104,8 @@ def reward(
     config: RegressionConfig,
 ) -> jax.Array:
     """What SAC maximises: rho - center, `[...]`."""
-    return target.scale * learned_reward(target, obs_t, action_t, next_obs_t, config) - target.center
+    learned = learned_reward(target, obs_t, action_t, next_obs_t, config)
+    return target.scale * learned - target.center
 
 
 def learned_reward(

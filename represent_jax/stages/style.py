@@ -1,4 +1,4 @@
-"""Tells strategies apart by single states: are demonstrators of different style, is a style kept."""
+"""Tells strategies apart by their states: do demonstrators differ, does a policy keep a style."""
 
 import itertools
 from collections.abc import Sequence
@@ -58,9 +58,7 @@ def fit(
 
     def loss_fn(params, index):
         logits = module.apply(params, (obs[index] - mean) / std)
-        return jnp.mean(
-            optax.softmax_cross_entropy_with_integer_labels(logits, strategy[index])
-        )
+        return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(logits, strategy[index]))
 
     def update(carry, key):
         params, opt = carry

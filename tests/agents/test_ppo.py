@@ -42,12 +42,17 @@ def trained():
 
 @functools.cache
 def fresh():
-    return jax.jit(lambda key: ppo.init(key, ENV, SMALL))(KEY)
+    return init(KEY)
 
 
 @functools.cache
 def first_rollout():
     return collect(fresh())
+
+
+@jax.jit
+def init(key):
+    return ppo.init(key, ENV, SMALL)
 
 
 @jax.jit
@@ -96,7 +101,7 @@ def test_bootstrap_adds_the_final_value_at_time_limits_alone():
 
 def test_noise_reaches_what_is_stored_but_not_what_the_policy_drew():
     start = jax.vmap(ENV.reset)(jax.random.split(KEY, 4), jnp.array([0.0, 0.0, 1.0, 1.0]))
-    state = ppo.init(KEY, ENV, SMALL, start)
+    state = jax.jit(lambda: ppo.init(KEY, ENV, SMALL, start))()
     _, rollout = collect(state)
     transitions, drawn = rollout.transitions, jnp.tanh(rollout.raw_action_t)
     as_drawn = np.isclose(transitions.action_t, drawn, atol=1e-5)[..., 0]
@@ -142,7 +147,7 @@ def test_population_equals_its_members():
     together, _ = population(keys)
     assert (together.env_steps, together.updates) == (24, 8)
     for i, key in enumerate(keys):
-        alone, _ = step(step(ppo.init(key, ENV, SMALL))[0])
+        alone, _ = step(step(init(key))[0])
         probes.assert_close(probes.take(together.learner, i), alone.learner)
 
 
@@ -181,7 +186,7 @@ def test_update_is_the_same_without_jit():
 def test_policies_of_sac_and_ppo_are_interchangeable():
     sac_config = sac.SacConfig(hidden_sizes=SMALL.hidden_sizes, normalize_observations=True)
     policy = sac.policy_of(sac.init_learner(KEY, 1, 1, sac_config))
-    state = ppo.init(KEY, ENV, SMALL, policy_params=policy)
+    state = jax.jit(lambda: ppo.init(KEY, ENV, SMALL, policy_params=policy))()
     probes.assert_equal(ppo.policy_of(state.learner), policy)
     obs_t, action_t = jnp.array([[0.3], [-2.0]]), jnp.array([[0.5], [1.0]])
     np.testing.assert_array_equal(

@@ -1,0 +1,101 @@
+"""Settings of the pipeline, and the problem it is given."""
+
+import dataclasses
+from typing import NamedTuple
+
+from represent_jax.config import require
+from represent_jax.data.trajectories import Demonstrations, Trajectory
+from represent_jax.envs import Environment, Episode
+from represent_jax.errors import RepresentError
+from represent_jax.stages.airl import AirlConfig
+from represent_jax.stages.curve import CurveConfig
+from represent_jax.stages.noise import NoiseConfig
+from represent_jax.stages.policies import PoliciesConfig
+from represent_jax.stages.regression import RegressionConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class RepresentConfig:
+    """Settings of the whole pipeline.
+
+    Attributes:
+      env: the environment's name.
+      preset: name of the preset the settings began as.
+      seed: seed of everything after the demonstrations.
+      backend: physics engine.
+      num_strategies: strategies used of those demonstrated; the first ones.
+      demonstrations: name or file of the demonstrations; the environment's own if empty.
+      horizon: environment steps of an episode; 0 is the environment's own.
+      population: how members run together, see `methods.population`.
+      airl, noise, curve, regression, policies: settings of the stages.
+    """
+
+    env: str = "half_cheetah"
+    preset: str = "quick"
+    seed: int = 0
+    backend: str = "auto"
+    num_strategies: int = 2
+    demonstrations: str = ""
+    horizon: int = 0
+    population: str = "auto"
+    airl: AirlConfig = AirlConfig()
+    noise: NoiseConfig = NoiseConfig()
+    curve: CurveConfig = CurveConfig()
+    regression: RegressionConfig = RegressionConfig()
+    policies: PoliciesConfig = PoliciesConfig()
+
+    def __post_init__(self) -> None:
+        require(self.num_strategies >= 1, "num_strategies", "at least 1", self.num_strategies)
+        require(self.seed >= 0, "seed", "at least 0", self.seed)
+        require(self.horizon >= 0, "horizon", "at least 0", self.horizon)
+
+
+class Problem(NamedTuple):
+    """What the method is given.
+
+    Attributes:
+      env: episodes that reset themselves.
+      demonstrations: of the strategies in use.
+      test: unseen trajectories; only evaluation looks at them.
+    """
+
+    env: Episode
+    demonstrations: Demonstrations
+    test: tuple[Trajectory, ...]
+
+
+def make_problem(
+    config: RepresentConfig, env: Environment, demonstrations: Demonstrations, test: Demonstrations
+) -> Problem:
+    """Checks demonstrations and test trajectories against the environment and cuts them to size.
+
+    Raises:
+      RepresentError: they do not fit the environment, or too few strategies are demonstrated.
+    """
+    horizon = config.horizon or env.horizon
+    for data in (demonstrations, test):
+        data.check_against(env.observation_size, env.action_size, -1.0, 1.0)
+    if config.num_strategies > demonstrations.num_strategies:
+        raise RepresentError(
+            f"num_strategies: expected at most {demonstrations.num_strategies}, as many as are "
+            f"demonstrated, found {config.num_strategies}"
+        )
+    own = [t for t in demonstrations.trajectories if t.strategy < config.num_strategies]
+    return Problem(
+        Episode(env, horizon),
+        dataclasses.replace(demonstrations, trajectories=tuple(_truncate(t, horizon) for t in own)),
+        tuple(_truncate(t, horizon) for t in test.trajectories),
+    )
+
+
+def _truncate(t: Trajectory, horizon: int) -> Trajectory:
+    if t.length <= horizon:
+        return t
+    return Trajectory(
+        t.obs[: horizon + 1], t.actions[:horizon], t.rewards[:horizon], False, t.strategy
+    )
+
+
+def target_names(num_strategies: int) -> tuple[str, ...]:
+    """Names of the rewards a run learns: "task", "strategy_1", ..."""
+    return ("task", *(f"strategy_{i + 1}" for i in range(num_strategies)))

@@ -1,0 +1,217 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import probes
+import pytest
+
+from represent_jax.agents import sac
+from represent_jax.errors import UsageError
+from represent_jax.methods.population import Population
+from represent_jax.runs import checkpoint
+
+KEY = jax.random.PRNGKey(0)
+CONFIG = sac.SacConfig(
+    num_envs=8,
+    updates_per_step=8,
+    batch_size=64,
+    buffer_capacity=4_096,
+    warmup_env_steps=256,
+    hidden_sizes=(16, 16),
+    learning_rate=3e-3,
+    discount=probes.DISCOUNT,
+    target_update_rate=0.05,
+    # The values are those without an entropy bonus.
+    initial_temperature=1e-3,
+    learn_temperature=False,
+)
+SMALL = sac.SacConfig(
+    num_envs=4,
+    updates_per_step=2,
+    batch_size=8,
+    buffer_capacity=64,
+    warmup_env_steps=12,
+    hidden_sizes=(8,),
+    normalize_observations=True,
+)
+ENV = probes.episode()
+
+
+@functools.cache
+def trained():
+    return probes.train_all(sac, CONFIG, 150, KEY)
+
+
+@functools.cache
+def fresh():
+    return init(KEY)
+
+
+@jax.jit
+def init(key):
+    return sac.init(key, ENV, SMALL)
+
+
+@jax.jit
+def step(state):
+    return sac.step(state, ENV, SMALL)
+
+
+def rows(state):
+    """The transitions in the buffer, in the order of their insertion."""
+    buffer = state.buffer
+    return sac.replay._unflatten(buffer.data[: int(buffer.inserted)], 1, 1)
+
+
+@pytest.mark.parametrize(("name", "x", "expected"), probes.VALUES)
+def test_critics_know_the_value(name, x, expected):
+    learner, obs_t = trained()[name], jnp.array([x])
+    action_t = sac.act(sac.policy_of(learner), obs_t, KEY, CONFIG, 1, deterministic=True)
+    critic = sac.make_networks(1, 1, CONFIG).sac.q_network
+    values = critic.apply(learner.obs_stats, learner.q_params, obs_t, action_t)
+    assert values.shape == (2,)
+    np.testing.assert_allclose(values, expected, atol=0.1)
+
+
+@pytest.mark.parametrize(("name", "x", "expected"), probes.ACTIONS)
+def test_policy_takes_the_best_action(name, x, expected):
+    policy = sac.policy_of(trained()[name])
+    action = sac.act(policy, jnp.array([x]), KEY, CONFIG, 1, deterministic=True)
+    assert action[0] == pytest.approx(expected, abs=0.1)
+
+
+def test_warm_up_stores_true_final_observations_and_no_termination():
+    state = fresh()
+    assert (state.env_steps, state.updates, state.buffer.inserted) == (12, 0, 12)
+    stored = rows(state)
+    # Episodes of two steps, 0 -> 1 -> 1, and a third step that begins the next one.
+    np.testing.assert_array_equal(stored.obs_t[:, 0], np.repeat([0.0, 1.0, 0.0], 4))
+    np.testing.assert_array_equal(stored.next_obs_t, np.ones((12, 1)))
+    np.testing.assert_array_equal(stored.discount_t, np.ones(12))
+    paid = probes.reward(probes.WORLD, stored.obs_t, stored.action_t, stored.next_obs_t)
+    np.testing.assert_allclose(stored.reward_t, paid, rtol=1e-5, atol=1e-6)
+
+
+def test_termination_is_stored():
+    env = probes.episode(probes.PROBES["delayed"])
+    state, transitions = jax.jit(lambda state: sac.collect(state, env, SMALL))(fresh())
+    # The episodes are one step old; the probe terminates at their second.
+    np.testing.assert_array_equal(transitions.discount_t, np.zeros(4))
+    np.testing.assert_array_equal(rows(state).discount_t, [1.0] * 12 + [0.0] * 4)
+
+
+def test_warm_up_follows_a_given_policy():
+    learner = sac.init_learner(KEY, 1, 1, SMALL)
+    zeros = jax.tree.map(jnp.zeros_like, learner.policy_params)
+    # With a mean of 20 before tanh, every action is 1.
+    zeros["params"]["hidden_1"]["bias"] = jnp.array([20.0, 0.0])
+    policy = sac.PolicyParams(learner.obs_stats, zeros)
+    state = jax.jit(lambda: sac.init(KEY, ENV, SMALL, policy_params=policy))()
+    probes.assert_equal(state.learner.policy_params, zeros)
+    np.testing.assert_allclose(rows(state).action_t, np.ones((12, 1)), rtol=1e-6)
+
+
+def test_warm_up_stores_a_learned_reward():
+    def seven(params, obs_t, action_t, next_obs_t):
+        return jnp.full(obs_t.shape[:-1], params)
+
+    state = jax.jit(lambda: sac.init(KEY, ENV, SMALL, reward_fn=seven, reward_params=7.0))()
+    np.testing.assert_array_equal(rows(state).reward_t, np.full(12, 7.0))
+
+
+def test_learned_reward_that_is_the_environments_own():
+    learned = jax.jit(lambda state: sac.step(state, ENV, SMALL, probes.reward, probes.WORLD))
+    probes.assert_close(learned(fresh()), step(fresh()))
+
+
+def test_recomputed_rewards_of_a_fixed_reward_are_those_stored():
+    again = jax.jit(lambda state: sac.step(state, ENV, SMALL, probes.reward, probes.WORLD, True))
+    probes.assert_close(again(fresh()), step(fresh()))
+
+
+def test_recomputed_rewards_are_those_of_the_latest_parameters():
+    def reward(params, obs_t, action_t, next_obs_t):
+        return jnp.full(obs_t.shape[:-1], params)
+
+    again = jax.jit(lambda state: sac.step(state, ENV, SMALL, reward, 7.0, recompute_rewards=True))
+    _, metrics = again(fresh())
+    assert metrics["batch_reward"] == 7.0
+    assert metrics["env_reward"] < 1.0
+
+
+def test_observation_statistics_are_those_of_the_observations_seen():
+    stats = step(fresh())[0].learner.obs_stats
+    # Four steps of four episodes: 0, 1, 0, 1.
+    assert int(stats.count) == 16
+    np.testing.assert_allclose(stats.mean, 0.5, rtol=1e-5)
+    np.testing.assert_allclose(stats.std, 0.5, rtol=1e-5)
+
+
+def test_population_equals_its_members():
+    def run(mode):
+        population = Population([jnp.float32(0.0)] * 2, mode, sac.population_axes)
+        states = population.init(lambda key, _: sac.init(key, ENV, SMALL), KEY)
+        step = population.stepper(lambda state, _: sac.train(state, ENV, SMALL, 2))
+        states, _ = step(states)
+        return states, population.members(states)
+
+    states, together = run("vmap")
+    assert (states.env_steps, states.updates, states.buffer.inserted) == (20, 4, 20)
+    # Here every member is a call of its own.
+    _, alone = run("threads")
+    for member, expected in zip(together, alone, strict=True):
+        probes.assert_close(member, expected)
+
+
+def test_environment_is_traced_once_per_program():
+    env = probes.episode()
+    jax.eval_shape(lambda key: sac.init(key, env, SMALL), KEY)
+    assert env.env.num_traces == 1
+    state = fresh()
+    train = jax.jit(lambda state: sac.train(state, env, SMALL, 2))
+    for _ in range(3):
+        state, _ = train(state)
+    assert env.env.num_traces == 2
+    assert state.env_steps == 36
+
+
+def test_restored_state_goes_on_bit_for_bit(tmp_path):
+    halfway, _ = step(fresh())
+    checkpoint.save(tmp_path / "state", halfway)
+    restored = checkpoint.load(tmp_path / "state", jax.eval_shape(fresh))
+    probes.assert_equal(restored, halfway)
+    probes.assert_equal(step(restored), step(halfway))
+
+
+def test_update_is_the_same_without_jit():
+    learner, batch = fresh().learner, probes.take(rows(fresh()), slice(8))
+    eager = sac.update(learner, batch, KEY, SMALL)
+    jitted = jax.jit(lambda *args: sac.update(*args, SMALL))(learner, batch, KEY)
+    probes.assert_close(jitted, eager)
+
+
+def test_density_integrates_to_one():
+    policy = sac.policy_of(fresh().learner)
+    action_t = jnp.linspace(-1.0, 1.0, 2_001)[:, None]
+    obs_t = jnp.full_like(action_t, 0.3)
+    density = jnp.exp(sac.log_prob(policy, obs_t, action_t, SMALL))
+    assert jnp.trapezoid(density, action_t[:, 0]) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"num_envs": 0},
+        {"updates_per_step": 0},
+        {"batch_size": 0},
+        {"warmup_env_steps": 0},
+        {"buffer_capacity": 100, "num_envs": 64},
+        {"buffer_capacity": 0},
+        {"discount": 1.0},
+        {"learning_rate": 0.0},
+    ],
+)
+def test_config_refuses(setting):
+    with pytest.raises(UsageError, match=next(iter(setting))):
+        sac.SacConfig(**setting)

@@ -1,0 +1,136 @@
+"""The whole pipeline with tiny budgets: every stage, both engines, killed and resumed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import represent_jax as rj
+from represent_jax.errors import RepresentError, UsageError
+
+ROOT = Path(__file__).parents[2]
+
+
+def _launch(out, *flags):
+    command = [sys.executable, "-m", "experiments.represent", "--preset=smoke", f"--out={out}"]
+    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    return subprocess.Popen(
+        [*command, *flags],
+        cwd=ROOT,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def _finish(process):
+    output, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, output
+    return output
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    out = tmp_path_factory.mktemp("run") / "whole"
+    record = out.parent / "records.jsonl"
+    output = _finish(_launch(out, "--backend=mujoco", f"--record={record}"))
+    return out, record, output
+
+
+def _results(run):
+    """What a run found, without what may differ between two runs of it."""
+    results = json.loads((run / "results.json").read_text())
+    return {k: v for k, v in results.items() if k not in ("seconds", "peak_memory_gib")}
+
+
+def test_run_directory_has_everything(finished):
+    out, record, output = finished
+    for name in ("config.json", "metrics.jsonl", "results.json", "report.html"):
+        assert (out / name).stat().st_size > 0
+    assert list((out / "tensorboard").rglob("events*"))
+    results = _results(out)
+    assert set(results["policies"]) == {"task", "strategy_1", "strategy_2"}
+    assert set(results["rewards"]) == {"task", "strategy_1", "strategy_2"}
+    assert "report:" in output
+    lines = [json.loads(line) for line in record.read_text().splitlines()]
+    assert {"pearson_test", "return_final", "demo_return"} <= {line["quantity"] for line in lines}
+    assert all(line["commit"] and line["versions"] for line in lines)
+
+
+def test_killed_at_three_points_and_resumed_ends_in_the_same_results(finished, tmp_path):
+    whole, _, _ = finished
+    out = tmp_path / "killed"
+    for stage in ("airl", "regression", "policies"):
+        process = _launch(out, "--backend=mujoco", "--resume", "--checkpoint_seconds=0")
+        deadline = time.monotonic() + 300
+        progress = out / "checkpoints" / stage / "progress"
+        while process.poll() is None and time.monotonic() < deadline:
+            if progress.exists() and list(progress.glob("[0-9]*")):
+                break
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    _finish(_launch(out, "--backend=mujoco", "--resume", "--checkpoint_seconds=0"))
+    assert _results(out) == _results(whole)
+    log = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    steps = [line["step"] for line in log if line["stage"] == "policies"]
+    assert steps == sorted(set(steps))
+
+
+def test_finished_run_is_not_run_again(finished):
+    out, _, _ = finished
+    before = (out / "metrics.jsonl").read_text().count('"airl"')
+    _finish(_launch(out, "--backend=mujoco", "--resume"))
+    assert (out / "metrics.jsonl").read_text().count('"stage": "airl"') <= before
+
+
+def test_pure_xla_pipeline(tmp_path):
+    _finish(_launch(tmp_path / "mjx", "--backend=mjx"))
+    assert _results(tmp_path / "mjx")["backend"] == "mjx"
+
+
+def test_loaded_reward_and_policy(finished):
+    out, _, _ = finished
+    reward, policy = rj.load_reward(out), rj.load_policy(out, target="strategy_1")
+    obs, action = np.zeros((5, 17), np.float32), np.zeros((5, 6), np.float32)
+    task = reward(obs, action, obs)
+    strategy = reward(obs, action, obs, target="strategy_2")
+    assert task.shape == (5,) and bool(np.any(task != strategy))
+    jitted = jax.jit(jax.vmap(lambda o: reward(o, action[0], o)))(obs)
+    np.testing.assert_allclose(jitted, task, rtol=1e-5)
+    assert policy(obs).shape == (5, 6) and float(np.abs(policy(obs)).max()) <= 1.0
+    with pytest.raises(UsageError, match="strategy_2"):
+        reward(obs, action, obs, target="strategy_3")
+    with pytest.raises(UsageError, match="strategy_1"):
+        rj.load_policy(out, target="strategy1")
+
+
+def test_reward_of_an_unfinished_run_is_an_error(tmp_path):
+    with pytest.raises(RepresentError):
+        rj.load_reward(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--env=halfcheetah", "half_cheetah"),
+        ("--preset=smok", "smoke"),
+        ("--backend=mjxx", "mjx"),
+        ("--override=airl.env_step=10", "airl.env_steps"),
+        ("--override=num_strategies=9", "num_strategies"),
+        ("--demonstrations=nothing.npz", "nothing.npz"),
+    ],
+)
+def test_bad_usage_is_one_line(tmp_path, flag, message):
+    process = _launch(tmp_path / "bad", flag)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode in (1, 2)
+    assert message in output and "Traceback" not in output

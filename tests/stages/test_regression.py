@@ -1,0 +1,156 @@
+"""Phase 3: each term of Eq. 2 in closed form, and a synthetic problem with a known answer."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from represent_jax.data.trajectories import TrajectoryBatch
+from represent_jax.errors import UsageError
+from represent_jax.stages import evaluation, regression
+from represent_jax.stages.regression import RegressionConfig, RegressionData
+
+CONFIG = RegressionConfig(
+    num_updates=300,
+    num_snippets=32,
+    states_per_snippet=8,
+    num_demonstration_states=32,
+    min_snippet_steps=5,
+    max_snippet_steps=20,
+    hidden_sizes=(16, 16),
+    learning_rate=3e-3,
+    kernel_scale=0.1,
+    l2=0.0,
+)
+
+
+def _batch(obs, lengths=None):
+    num, steps_plus_one, _ = obs.shape
+    horizon = steps_plus_one - 1
+    lengths = np.full(num, horizon) if lengths is None else np.asarray(lengths)
+    return TrajectoryBatch(
+        obs=jnp.asarray(obs, jnp.float32),
+        actions=jnp.zeros((num, horizon, 1)),
+        rewards=jnp.zeros((num, horizon)),
+        mask=jnp.asarray(np.arange(horizon) < lengths[:, None], jnp.float32),
+        strategy=jnp.zeros(num, jnp.int32),
+        noise_level=jnp.zeros(num),
+    )
+
+
+def test_ssrr_loss_of_constant_rewards_is_the_squared_error():
+    snippets = regression.Snippets(
+        inputs=jnp.zeros((2, 4, 1)), share=jnp.array([0.5, 0.25]), target=jnp.array([1.0, 0.0])
+    )
+    rho = jnp.array([[0.5] * 4, [2.0] * 4])
+    expected = np.mean([(10 * 0.5 * (0.5 - 1.0)) ** 2, (10 * 0.25 * 2.0) ** 2])
+    np.testing.assert_allclose(regression.ssrr_loss(rho, snippets, 10.0), expected, rtol=1e-6)
+
+
+def test_ssrr_loss_is_unbiased_by_the_sampling_of_states():
+    rewards = jax.random.normal(jax.random.PRNGKey(0), (20_000, 16)) + 0.7
+    snippets = regression.Snippets(
+        inputs=jnp.zeros(()), share=jnp.full(20_000, 0.1), target=jnp.full(20_000, 0.7)
+    )
+    assert abs(float(regression.ssrr_loss(rewards, snippets, 10.0))) < 0.01
+
+
+def test_snippets_never_leave_the_running_steps_and_count_the_nominal_horizon():
+    horizon, lengths = 40, np.array([3, 12, 40])
+    obs = np.tile(np.arange(horizon + 1.0)[None, :, None], (3, 1, 1))
+    snippets = regression.sample_snippets(
+        jax.random.PRNGKey(0),
+        _batch(obs, lengths),
+        jnp.array([0.1, 0.2, 0.3]),
+        dataclasses.replace(CONFIG, num_snippets=500),
+    )
+    owner = jnp.searchsorted(jnp.array([0.1, 0.2, 0.3]), snippets.target)
+    last = jnp.asarray(lengths)[owner]
+    # The input is the state after the step: 1 to length.
+    assert bool(jnp.all(snippets.inputs[..., 0] >= 1.0))
+    assert bool(jnp.all(snippets.inputs[..., 0] <= last[:, None]))
+    steps = snippets.share * horizon
+    assert bool(jnp.all(steps <= jnp.minimum(last, CONFIG.max_snippet_steps) + 1e-4))
+    assert bool(jnp.all(steps >= jnp.minimum(last, CONFIG.min_snippet_steps) - 1e-4))
+
+
+@pytest.mark.parametrize(
+    ("reading", "expected"),
+    [
+        ("log_ratio", (0.2 - 1.0 - np.log(0.7)) ** 2 + (0.5 - 0.8 - np.log(0.7)) ** 2),
+        (
+            "flair",
+            (np.exp(0.2) - 0.7 * np.exp(1.0)) ** 2 + (np.exp(0.5) - 0.7 * np.exp(0.8)) ** 2,
+        ),
+        ("literal", (np.exp(1.0) - np.exp(0.2)) ** 2 + (np.exp(0.8) - np.exp(0.5)) ** 2),
+    ],
+)
+def test_discrimination_readings(reading, expected):
+    utility = jnp.array([[1.0, 0.2], [0.5, 0.8]])
+    config = dataclasses.replace(CONFIG, discrimination=reading)
+    np.testing.assert_allclose(regression.discrimination_loss(utility, config), expected, rtol=1e-5)
+
+
+def test_discrimination_pushes_only_the_other_strategies_down():
+    utility = jnp.array([[1.0, 1.0], [1.0, 1.0]])
+    grads = jax.grad(lambda u: regression.discrimination_loss(u, CONFIG))(utility)
+    np.testing.assert_allclose(jnp.diagonal(grads), 0.0)
+    assert float(grads[0, 1]) > 0.0 and float(grads[1, 0]) > 0.0
+
+
+def test_reward_is_task_plus_weighted_strategy():
+    config = dataclasses.replace(CONFIG, strategy_weight=0.5, ensemble_size=2)
+    rewards = regression.init(jax.random.PRNGKey(0), 3, 1, 2, config).rewards
+    obs = jax.random.normal(jax.random.PRNGKey(1), (7, 3))
+    task = regression.reward(rewards, obs, None, obs, config)
+    head = jax.tree.map(lambda leaf: leaf[:, 1], rewards.strategies)
+    own = regression.head_reward(head, obs, None, obs, config)
+    found = regression.reward(rewards, obs, None, obs, config, strategy=1)
+    np.testing.assert_allclose(found, task + 0.5 * own, rtol=1e-6)
+
+
+def test_known_reward_is_recovered_and_decomposed():
+    """Two strategies in different places; the curve knows a shared feature, x, and nothing else."""
+    key = jax.random.PRNGKey(0)
+    horizon, num = 40, 60
+    levels = jnp.linspace(1.0, 0.0, num)
+    data = []
+    for strategy, place in enumerate((-1.0, 1.0)):
+        noise = 0.3 * jax.random.normal(jax.random.fold_in(key, strategy), (num, horizon + 1, 2))
+        centre = jnp.stack([levels, jnp.full(num, place)], axis=-1)
+        data.append(_batch(centre[:, None] + noise))
+    noisy = jax.tree.map(lambda *x: jnp.stack(x), *data)
+    demonstrations = jax.tree.map(lambda x: x[:, :4], noisy)
+    problem = RegressionData(noisy, jnp.stack([levels, levels]), demonstrations)
+    state = regression.init(jax.random.PRNGKey(1), 2, 1, 2, CONFIG)
+    state, metrics = jax.jit(
+        lambda state: regression.train(state, problem, CONFIG, CONFIG.num_updates)
+    )(state)
+    assert float(metrics["strategy_reward_own"]) > float(metrics["strategy_reward_others"])
+    unseen = jax.random.uniform(jax.random.PRNGKey(2), (200, 2), minval=-1.0, maxval=1.0)
+    for strategy in (None, 0, 1):
+        learned = regression.reward(state.rewards, unseen, None, unseen, CONFIG, strategy)
+        assert float(evaluation.pearson(unseen[:, 0], learned)) > 0.9
+
+
+def test_step_is_the_same_without_jit():
+    obs = np.random.default_rng(0).normal(size=(1, 3, 21, 2))
+    noisy = jax.tree.map(lambda x: x[None], _batch(obs[0]))
+    problem = RegressionData(noisy, jnp.ones((1, 3)), noisy)
+    state = regression.init(jax.random.PRNGKey(0), 2, 1, 1, CONFIG)
+    compiled, _ = jax.jit(lambda state: regression.step(state, problem, CONFIG))(state)
+    with jax.disable_jit():
+        plain, _ = regression.step(state, problem, CONFIG)
+    for a, b in zip(jax.tree.leaves(compiled), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+
+
+def test_bad_settings_are_named():
+    with pytest.raises(UsageError, match=r"discrimination.*log_ratio"):
+        RegressionConfig(discrimination="unknown")
+    with pytest.raises(UsageError, match="states_per_snippet"):
+        RegressionConfig(states_per_snippet=3)
+    with pytest.raises(UsageError, match="max_snippet_steps"):
+        RegressionConfig(min_snippet_steps=50, max_snippet_steps=40)
