@@ -79,9 +79,10 @@ DEMONSTRATORS = {
     "half_cheetah": DemonstratorConfig(
         seed=1,
         test_seed=101,
-        env_steps=240_000,
+        env_steps=160_000,
         test_env_steps=480_000,
-        snapshot_env_steps=4_000,
+        snapshot_env_steps=2_048,
+        min_skill_accuracy=0.75,
         diayn=DiaynConfig(
             num_skills=3,
             diversity_weight=2.0,
@@ -102,7 +103,7 @@ DEMONSTRATORS = {
     "inverted_double_pendulum": DemonstratorConfig(
         env="inverted_double_pendulum",
         env_steps=160_000,
-        test_env_steps=120_000,
+        test_env_steps=240_000,
         snapshot_env_steps=1_600,
         target_returns=(861.84, 1217.65),
         trajectories_per_skill=20,
