@@ -51,7 +51,7 @@ class AirlConfig:
       sac: the generator.
     """
 
-    env_steps: int = 240_000
+    env_steps: int = 160_000
     noisy: bool = True
     state_only: bool = True
     hidden_sizes: tuple[int, ...] = (64, 64)
