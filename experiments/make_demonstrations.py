@@ -48,7 +48,10 @@ def _make_demonstrations(config: demonstrators.DemonstratorConfig, path: Path) -
         _BACKEND.value,
     )
     trajectories, env_steps = demonstrators.choose_demonstrations(
-        snapshots, config.target_returns, config.min_skill_accuracy
+        snapshots,
+        config.target_returns,
+        config.min_skill_accuracy,
+        config.strategy_order,
     )
     accuracy = style.pairwise_accuracy(trajectories)
     metadata = {

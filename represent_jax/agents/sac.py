@@ -69,7 +69,11 @@ class SacConfig:
             self.buffer_capacity,
         )
         require(0.0 < self.discount < 1.0, "discount", "in (0, 1)", self.discount)
-        require(self.learning_rate > 0.0, "learning_rate", "positive", self.learning_rate)
+        for field in ("learning_rate", "initial_temperature"):
+            require(getattr(self, field) > 0.0, field, "positive", getattr(self, field))
+        rate = self.target_update_rate
+        require(0.0 < rate <= 1.0, "target_update_rate", "in (0, 1]", rate)
+        require(len(self.hidden_sizes) >= 1, "hidden_sizes", "at least one", self.hidden_sizes)
 
 
 @struct.dataclass

@@ -26,7 +26,7 @@ def _smoke(env: str) -> RepresentConfig:
         preset="smoke",
         horizon=20,
         airl=AirlConfig(
-            env_steps=160, hidden_sizes=(8, 8), batch_size=8, updates_per_step=1, sac=tiny
+            env_steps=160, cloning_updates=5, hidden_sizes=(8, 8), batch_size=8, updates_per_step=1, sac=tiny
         ),
         noise=NoiseConfig(num_levels=5, level_step=0.2, trajectories_per_level=2),
         regression=RegressionConfig(

@@ -20,7 +20,7 @@ import optax
 from brax.training import networks as brax_networks
 from flax import linen, struct
 
-from represent_jax.agents import sac
+from represent_jax.agents import cloning, sac
 from represent_jax.agents.sac import SacConfig
 from represent_jax.config import require
 from represent_jax.envs.episode import Episode
@@ -36,6 +36,8 @@ class AirlConfig:
 
     Attributes:
       env_steps: budget of each strategy.
+      cloning_updates: updates of behavioural cloning that the generator starts from; 0 starts it
+        from random networks.
       noisy: whether training environments have the noise levels of SSRR (Noisy-AIRL).
       state_only: whether g sees the next state alone, or state and action too.
       hidden_sizes: units of the hidden layers of g and h.
@@ -52,6 +54,7 @@ class AirlConfig:
     """
 
     env_steps: int = 160_000
+    cloning_updates: int = 2_000
     noisy: bool = True
     state_only: bool = True
     hidden_sizes: tuple[int, ...] = (64, 64)
@@ -69,6 +72,7 @@ class AirlConfig:
     def __post_init__(self) -> None:
         for field in ("env_steps", "batch_size", "updates_per_step"):
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
+        require(self.cloning_updates >= 0, "cloning_updates", ">= 0", self.cloning_updates)
         require(self.gradient_penalty >= 0, "gradient_penalty", ">= 0", self.gradient_penalty)
 
 
@@ -117,7 +121,7 @@ def _networks(config: AirlConfig):
 
 def init(key: jax.Array, env: Episode, demonstrations: Transition, config: AirlConfig) -> AirlState:
     """Starts training on one strategy's transitions, `[num_transitions]`."""
-    key_sac, key_reset, key_g, key_h = jax.random.split(key, 4)
+    key_sac, key_reset, key_g, key_h, key_clone = jax.random.split(key, 5)
     num_envs = config.sac.num_envs
     levels = jnp.asarray(TRAINING_NOISE_LEVELS if config.noisy else (0.0,))
     levels = jnp.resize(levels, (num_envs,))
@@ -131,7 +135,14 @@ def init(key: jax.Array, env: Episode, demonstrations: Transition, config: AirlC
         # A floor, for observations that hardly move in the demonstrations.
         std=jnp.std(obs, axis=0) + 1e-2,
     )
-    agent = sac.init(key_sac, env, config.sac, start)
+    policy = None
+    if config.cloning_updates:
+        sizes = (env.observation_size, env.action_size)
+        learner = sac.init_learner(key_clone, *sizes, config.sac)
+        policy = sac.policy_of(
+            cloning.clone(key_clone, learner, demonstrations, config.sac, config.cloning_updates)
+        )
+    agent = sac.init(key_sac, env, config.sac, start, policy)
     return AirlState(agent, reward, optimizer.init((reward.g, reward.h)))
 
 
