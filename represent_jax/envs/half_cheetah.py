@@ -14,7 +14,7 @@ class HalfCheetah(Task):
 
     name = "half_cheetah"
     frame_skip = 5
-    mjx_solver = MjxSolver(iterations=4, ls_iterations=8)
+    mjx_solver = MjxSolver(iterations=4, ls_iterations=4)
 
     def load_model(self) -> mujoco.MjModel:
         return load_gymnasium_model("half_cheetah.xml")

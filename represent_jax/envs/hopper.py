@@ -18,7 +18,7 @@ class Hopper(Task):
 
     name = "hopper"
     frame_skip = 4
-    mjx_solver = MjxSolver(iterations=4, ls_iterations=8)
+    mjx_solver = MjxSolver(iterations=4, ls_iterations=4)
 
     def __init__(self, terminates: bool = False):
         self.terminates = terminates

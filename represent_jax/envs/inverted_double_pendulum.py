@@ -19,7 +19,7 @@ class InvertedDoublePendulum(Task):
     name = "inverted_double_pendulum"
     frame_skip = 5
     derived_fields = ("site_xpos", "qfrc_constraint")
-    mjx_solver = MjxSolver(iterations=4, ls_iterations=8)
+    mjx_solver = MjxSolver(iterations=2, ls_iterations=4)
 
     def __init__(self, terminates: bool = True):
         self.terminates = terminates

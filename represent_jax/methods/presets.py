@@ -1,6 +1,5 @@
 """Settings by preset: `smoke` for tests, `quick` for a laptop, `paper` for the full protocol."""
 
-import dataclasses
 from collections.abc import Callable
 
 from represent_jax.agents.sac import SacConfig
@@ -26,7 +25,12 @@ def _smoke(env: str) -> RepresentConfig:
         preset="smoke",
         horizon=20,
         airl=AirlConfig(
-            env_steps=160, cloning_updates=5, hidden_sizes=(8, 8), batch_size=8, updates_per_step=1, sac=tiny
+            env_steps=160,
+            cloning_updates=5,
+            hidden_sizes=(8, 8),
+            batch_size=8,
+            updates_per_step=1,
+            sac=tiny,
         ),
         noise=NoiseConfig(num_levels=5, level_step=0.2, trajectories_per_level=2),
         regression=RegressionConfig(
@@ -44,17 +48,21 @@ def _smoke(env: str) -> RepresentConfig:
 
 
 def _quick(env: str) -> RepresentConfig:
-    return RepresentConfig(env=env, preset="quick")
+    return RepresentConfig(
+        env=env,
+        preset="quick",
+        regression=RegressionConfig(num_updates=2000, hidden_sizes=(128, 128)),
+        policies=PoliciesConfig(env_steps=320_000),
+    )
 
 
 def _paper(env: str) -> RepresentConfig:
-    quick = _quick(env)
-    return dataclasses.replace(
-        quick,
+    return RepresentConfig(
+        env=env,
         preset="paper",
-        airl=dataclasses.replace(quick.airl, env_steps=2 * quick.airl.env_steps),
-        regression=dataclasses.replace(quick.regression, ensemble_size=3, num_updates=6000),
-        policies=dataclasses.replace(quick.policies, env_steps=1_000_000),
+        airl=AirlConfig(env_steps=320_000),
+        regression=RegressionConfig(num_updates=6000, ensemble_size=3),
+        policies=PoliciesConfig(env_steps=1_000_000),
     )
 
 

@@ -193,7 +193,7 @@ def importance_weight(
     """
     log_uniform = -action_dim * jnp.log(2.0)
     noisy = jnp.logaddexp(
-        jnp.log(jnp.maximum(noise_level_t, 1e-20)) + log_uniform,
+        jnp.log(noise_level_t) + log_uniform,
         jnp.log1p(-noise_level_t) + log_prob_t,
     )
     return jnp.exp(log_prob_t - noisy)
