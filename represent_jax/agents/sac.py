@@ -35,6 +35,8 @@ class SacConfig:
       batch_size: transitions in each update.
       buffer_capacity: transitions kept, a multiple of `num_envs`.
       warmup_env_steps: environment steps taken before the first update.
+      critic_warmup_updates: first updates in which only the critics learn, so that an actor that
+        was learned elsewhere is not undone by critics that know nothing yet.
       hidden_sizes: units of the hidden layers of actor and critics.
       learning_rate: Adam's step size of actor, critics and temperature.
       discount: discount factor of an environment step.
@@ -50,6 +52,7 @@ class SacConfig:
     batch_size: int = 256
     buffer_capacity: int = 512_000
     warmup_env_steps: int = 6_400
+    critic_warmup_updates: int = 0
     hidden_sizes: tuple[int, ...] = (128, 128)
     learning_rate: float = 3e-4
     discount: float = 0.99
@@ -71,6 +74,12 @@ class SacConfig:
         require(0.0 < self.discount < 1.0, "discount", "in (0, 1)", self.discount)
         for field in ("learning_rate", "initial_temperature"):
             require(getattr(self, field) > 0.0, field, "positive", getattr(self, field))
+        require(
+            self.critic_warmup_updates >= 0,
+            "critic_warmup_updates",
+            "at least 0",
+            self.critic_warmup_updates,
+        )
         rate = self.target_update_rate
         require(0.0 < rate <= 1.0, "target_update_rate", "in (0, 1]", rate)
         require(len(self.hidden_sizes) >= 1, "hidden_sizes", "at least one", self.hidden_sizes)
@@ -383,12 +392,23 @@ def learn(state: SacState, batches: Transition, config: SacConfig) -> tuple[SacS
     """Makes one update for each batch, `[num_updates, batch_size]`, in order."""
     num_updates = batches.reward_t.shape[0]
     keys = jax.random.split(state.key, num_updates + 1)
+    numbers = state.updates + jnp.arange(num_updates)
 
     def body(learner, inputs):
-        batch, key = inputs
-        return update(learner, batch, key, config)
+        batch, key, number = inputs
+        updated, metrics = update(learner, batch, key, config)
+        if config.critic_warmup_updates:
+            warming = number < config.critic_warmup_updates
+            frozen = updated.replace(
+                policy_params=learner.policy_params,
+                policy_opt=learner.policy_opt,
+                log_temperature=learner.log_temperature,
+                temperature_opt=learner.temperature_opt,
+            )
+            updated = jax.tree.map(lambda a, b: jnp.where(warming, a, b), frozen, updated)
+        return updated, metrics
 
-    learner, metrics = jax.lax.scan(body, state.learner, (batches, keys[1:]))
+    learner, metrics = jax.lax.scan(body, state.learner, (batches, keys[1:], numbers))
     state = state.replace(learner=learner, key=keys[0], updates=state.updates + num_updates)
     return state, jax.tree.map(jnp.mean, metrics)
 

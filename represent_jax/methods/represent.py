@@ -292,17 +292,18 @@ def run_policies(
         for strategy in (None, *range(num_strategies))
     ]
     starts = [jax.tree.map(lambda x, i=i: x[i], first.policy) for i in range(num_strategies)]
-    task_start = _best_start(key_start, env, targets[0], starts, config)
-    members = list(zip(targets, [starts[task_start], *starts], strict=True))
 
     def init(key, member):
         return policies.init(key, env, *member, *learning)
 
     if directory.is_done("policies"):
-        example = sac.policy_of(jax.eval_shape(init, key, members[0]).learner)
+        state = jax.eval_shape(init, key, (targets[0], starts[0]))
+        example = sac.policy_of(state.learner)
         return directory.load_output(
-            "policies", jax.tree.map(lambda x: _shape_like(x, len(members)), example)
+            "policies", jax.tree.map(lambda x: _shape_like(x, len(targets)), example)
         )
+    task_start = _best_start(key_start, env, targets[0], starts, config)
+    members = list(zip(targets, [starts[task_start], *starts], strict=True))
     population = Population(members, config.population, sac.population_axes)
     step = population.stepper(
         lambda state, member: policies.train(state, env, member[0], *learning)

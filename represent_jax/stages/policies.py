@@ -40,7 +40,12 @@ class PoliciesConfig:
     center: float = 1.0
     eval_env_steps: int = 20_000
     eval_episodes: int = 5
-    sac: SacConfig = SacConfig(initial_temperature=0.05, learning_rate=1e-3)
+    sac: SacConfig = SacConfig(
+        initial_temperature=0.05,
+        learning_rate=1e-3,
+        warmup_env_steps=19_200,
+        critic_warmup_updates=2_000,
+    )
 
     def __post_init__(self) -> None:
         require(self.start in ("phase1", "cold"), "start", "'phase1' or 'cold'", self.start)
