@@ -128,6 +128,7 @@ def _engines() -> None:
             _record(name, row.name, "env_steps_per_second", row.rate, f"num_envs={num_envs}")
             _record(name, row.name, "ratio_to_python_loop", ratio, f"num_envs={num_envs}")
     _print_table(heads, table)
+    print("Actions are random. Gymnasium and 'episodes' restart what has ended, others go on.\n")
 
 
 def _python_loop(env: Environment, num_envs: int) -> Row:
