@@ -30,6 +30,11 @@ class Episode(base.Env):
         self.auto_reset = auto_reset
 
     @property
+    def terminates(self) -> bool:
+        """Whether episodes can end before the horizon."""
+        return self.env.terminates
+
+    @property
     def observation_size(self) -> int:
         return self.env.observation_size
 

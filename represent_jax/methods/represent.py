@@ -288,7 +288,7 @@ def run_policies(
     learning = (config.policies, config.regression)
     key_start, key = jax.random.split(key)
     targets = [
-        policies.make_target(rewards, strategy, env.horizon, *learning)
+        policies.make_target(rewards, strategy, env, *learning)
         for strategy in (None, *range(num_strategies))
     ]
     starts = [jax.tree.map(lambda x, i=i: x[i], first.policy) for i in range(num_strategies)]

@@ -180,7 +180,7 @@ def _policy_results(
     for target, name in enumerate(target_names(len(demo_means))):
         strategy = target - 1 if target else None
         reward_target = policies.make_target(
-            rewards, strategy, env.horizon, config.policies, config.regression
+            rewards, strategy, env, config.policies, config.regression
         )
         policy = jax.tree.map(lambda x, target=target: x[target], trained)
 

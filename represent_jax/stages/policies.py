@@ -29,7 +29,8 @@ class PoliciesConfig:
     Attributes:
       env_steps: budget of each target.
       start: "phase1" starts from Phase 1's policy, "cold" from random networks.
-      center: subtracted from rho at every step.
+      center: subtracted from rho at every step, unless episodes can end early: there a negative
+        reward would pay for ending them.
       eval_env_steps: environment steps between two evaluations.
       eval_episodes: deterministic episodes of an evaluation.
       sac: the agent.
@@ -84,7 +85,7 @@ class Evaluation(NamedTuple):
 def make_target(
     rewards: regression.Rewards,
     strategy: int | None,
-    horizon: int,
+    env: Episode,
     config: PoliciesConfig,
     regression_config: RegressionConfig,
 ) -> Target:
@@ -96,8 +97,8 @@ def make_target(
     return Target(
         heads,
         jnp.float32(weight),
-        jnp.float32(horizon / regression_config.return_scale),
-        jnp.float32(config.center),
+        jnp.float32(env.horizon / regression_config.return_scale),
+        jnp.float32(0.0 if env.terminates else config.center),
     )
 
 
