@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from represent_jax.data.trajectories import TrajectoryBatch
+from represent_jax.data.trajectories import TrajectoryBatch, returns
 from represent_jax.envs.episode import Episode
 from represent_jax.types import Params, PolicyFn, RewardFn
 
@@ -64,7 +64,7 @@ def rollout(
 
 def true_returns(batch: TrajectoryBatch) -> jax.Array:
     """Undiscounted return under the environment's reward, `[num_episodes]`."""
-    return jnp.sum(batch.rewards * batch.mask, axis=-1)
+    return returns(batch)
 
 
 def learned_returns(batch: TrajectoryBatch, reward_fn: RewardFn, params: Params) -> jax.Array:

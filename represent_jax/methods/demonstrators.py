@@ -18,7 +18,7 @@ from represent_jax.agents import sac
 from represent_jax.agents.rollout import rollout
 from represent_jax.agents.sac import SacConfig
 from represent_jax.config import require
-from represent_jax.data.trajectories import Trajectory, TrajectoryBatch, unpad
+from represent_jax.data.trajectories import Trajectory, TrajectoryBatch, returns, unpad
 from represent_jax.envs import Episode, make_env
 from represent_jax.errors import RepresentError
 from represent_jax.runs.loop import advance
@@ -192,8 +192,8 @@ def train(
     def chunk(state):
         state, _ = train_steps(state)
         snapshot = snap(state)
-        returns = _returns(snapshot.trajectories).mean(axis=1)
-        return state, {"returns": returns, "accuracy": snapshot.accuracy}
+        means = returns(snapshot.trajectories).mean(axis=1)
+        return state, {"returns": means, "accuracy": snapshot.accuracy}
 
     snap(state)
     advance(
@@ -206,10 +206,6 @@ def train(
         describe=lambda m: f"returns {m['returns'].round()}, known by {m['accuracy'].round(2)}",
     )
     return snapshots
-
-
-def _returns(batch: TrajectoryBatch) -> np.ndarray:
-    return (batch.rewards * batch.mask).sum(axis=-1)
 
 
 def choose_demonstrations(
@@ -235,14 +231,14 @@ def choose_demonstrations(
       Trajectories of all strategies, and the environment steps of each strategy's snapshot.
     """
     targets = np.asarray(target_returns)
-    returns = np.stack([_returns(s.trajectories) for s in snapshots])
+    episodes = np.stack([returns(s.trajectories) for s in snapshots])
     known = np.stack([s.accuracy for s in snapshots]) >= min_skill_accuracy
     if not known.any(axis=0).all():
         raise RepresentError(
             f"skills {np.flatnonzero(~known.any(axis=0)).tolist()} are never known by "
             f"{min_skill_accuracy:.0%} of their states: train longer or raise diversity_weight"
         )
-    mean, spread = returns.mean(axis=-1)[..., None], returns.std(axis=-1)[..., None]
+    mean, spread = episodes.mean(axis=-1)[..., None], episodes.std(axis=-1)[..., None]
     cost = np.abs(mean / targets - 1.0) + spread / np.abs(targets)  # [snapshot, skill, target]
     cost = np.where(known[:, :, None], cost, np.inf)
     order = min(
