@@ -2,6 +2,7 @@
 
 python -m experiments.represent --env=half_cheetah --preset=quick --out=runs/demo
 python -m experiments.represent --env=hopper --seed=1 --override policies.env_steps=200000
+python -m experiments.represent --env=hopper --until=regression --out=runs/hopper
 """
 
 import dataclasses
@@ -31,6 +32,9 @@ _DEMONSTRATIONS = flags.DEFINE_string(
 _OUT = flags.DEFINE_string("out", None, "Run folder; runs/<env>-<preset>-<seed> if not given.")
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting as dotted.key=value; repeatable.")
 _RESUME = flags.DEFINE_bool("resume", False, "Go on with the run in the folder.")
+_UNTIL = flags.DEFINE_string(
+    "until", represent.STAGES[-1], f"Last stage to run: {', '.join(represent.STAGES)}."
+)
 _CHECKPOINT_SECONDS = flags.DEFINE_float(
     "checkpoint_seconds", 60.0, "Least time between two checkpoints of a stage."
 )
@@ -65,7 +69,10 @@ def _run(config: RepresentConfig, out: str) -> None:
     if problem.demonstrations.num_strategies == 1:
         print("one strategy alone: the rewards are learned, but nothing is decomposed")
     with open_run(out, config, resume=_RESUME.value) as run:
-        results = represent.run(config, problem, run, _CHECKPOINT_SECONDS.value)
+        results = represent.run(config, problem, run, _CHECKPOINT_SECONDS.value, _UNTIL.value)
+        if results is None:
+            print(f"{out}: done until {_UNTIL.value}; --resume goes on")
+            return
         page = html.write_report(run.path)
     print(tables.summary(results))
     print(f"report: {page}")

@@ -56,8 +56,7 @@ def main(argv: list[str]) -> None:
         def reward_fn(_, obs_t, action_t, next_obs_t):
             return scale * learned(obs_t, action_t, next_obs_t, target=_TARGET.value)
 
-    steps_per_call = config.num_envs * getattr(config, "unroll_length", 1)
-    num_steps = max(1, _EVAL_ENV_STEPS.value // steps_per_call)
+    num_steps = max(1, _EVAL_ENV_STEPS.value // config.env_steps_per_step)
 
     def chunk(state):
         state, metrics = agent.train(state, env, config, num_steps, reward_fn)
@@ -75,7 +74,7 @@ def main(argv: list[str]) -> None:
     with open_run(_OUT.value, _settings(config), resume=_RESUME.value) as run:
         start = time.monotonic()
         init = jax.jit(lambda key: agent.init(key, env, config))
-        env_steps = num_steps * steps_per_call
+        env_steps = num_steps * config.env_steps_per_step
         state = advance(
             run,
             "policy",

@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 
 from represent_jax import config as configs
-from represent_jax.agents import sac
 from represent_jax.envs import make_env
 from represent_jax.errors import RepresentError, unknown
 from represent_jax.methods.config import RepresentConfig, target_names
 from represent_jax.runs import RunDirectory, load_config_json
-from represent_jax.stages import regression
+from represent_jax.stages import policies, regression
 
 
 def load_config(run_dir: str | os.PathLike) -> RepresentConfig:
@@ -82,21 +81,21 @@ def load_policy(
     if not run.is_done("policies"):
         raise RepresentError(f"{run_dir}: this run has no policies yet, it was not run to its end")
     env = make_env(config.env, config.backend)
-    agent = config.policies.sac
+    agent, settings = policies.agent_of(config.policies)
     learner = jax.eval_shape(
-        lambda key: sac.init_learner(key, env.observation_size, env.action_size, agent),
+        lambda key: agent.init_learner(key, env.observation_size, env.action_size, settings),
         jax.random.PRNGKey(0),
     )
     example = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((len(targets), *x.shape), x.dtype), sac.policy_of(learner)
+        lambda x: jax.ShapeDtypeStruct((len(targets), *x.shape), x.dtype), agent.policy_of(learner)
     )
     stacked = run.load_output("policies", example)
     params = jax.tree.map(lambda x: x[targets.index(target)], stacked)
 
     def policy(obs) -> jax.Array:
         unused_key = jax.random.PRNGKey(0)
-        return sac.act(
-            params, jnp.asarray(obs), unused_key, agent, env.action_size, deterministic=True
+        return agent.act(
+            params, jnp.asarray(obs), unused_key, settings, env.action_size, deterministic=True
         )
 
     return policy

@@ -77,6 +77,11 @@ class PpoConfig:
         require(self.clip_epsilon > 0.0, "clip_epsilon", "positive", self.clip_epsilon)
         require(self.entropy_weight >= 0.0, "entropy_weight", ">= 0", self.entropy_weight)
 
+    @property
+    def env_steps_per_step(self) -> int:
+        """Environment steps of one training step."""
+        return self.num_envs * self.unroll_length
+
 
 @struct.dataclass
 class LearnerState:
@@ -189,6 +194,8 @@ def init(
     config: PpoConfig,
     start: Any = None,
     policy_params: PolicyParams | None = None,
+    reward_fn: RewardFn | None = None,
+    reward_params: Params = None,
 ) -> PpoState:
     """Starts episodes.
 
@@ -198,10 +205,12 @@ def init(
       config: settings.
       start: `num_envs` stacked episode states to begin in; by default fresh ones without noise.
       policy_params: a policy to start from, of PPO or of SAC with the same `hidden_sizes`.
+      reward_fn, reward_params: unused, for the shape that agents share; nothing is stored here.
 
     Returns:
       A state from which `step` goes on.
     """
+    del reward_fn, reward_params
     key_learner, key_env, key = jax.random.split(key, 3)
     learner = init_learner(key_learner, env.observation_size, env.action_size, config)
     if policy_params is not None:

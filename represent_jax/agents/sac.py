@@ -84,6 +84,11 @@ class SacConfig:
         require(0.0 < rate <= 1.0, "target_update_rate", "in (0, 1]", rate)
         require(len(self.hidden_sizes) >= 1, "hidden_sizes", "at least one", self.hidden_sizes)
 
+    @property
+    def env_steps_per_step(self) -> int:
+        """Environment steps of one training step."""
+        return self.num_envs
+
 
 @struct.dataclass
 class LearnerState:

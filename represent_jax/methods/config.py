@@ -7,6 +7,7 @@ from represent_jax.config import require
 from represent_jax.data.trajectories import Demonstrations, Trajectory
 from represent_jax.envs import Environment, Episode
 from represent_jax.errors import RepresentError
+from represent_jax.stages import airl, policies
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.curve import CurveConfig
 from represent_jax.stages.noise import NoiseConfig
@@ -48,6 +49,14 @@ class RepresentConfig:
         require(self.num_strategies >= 1, "num_strategies", "at least 1", self.num_strategies)
         require(self.seed >= 0, "seed", "at least 0", self.seed)
         require(self.horizon >= 0, "horizon", "at least 0", self.horizon)
+        if self.policies.start == "phase1":
+            _, settings = airl.generator(self.airl)
+            require(
+                policies.agent_of(self.policies)[1].hidden_sizes == settings.hidden_sizes,
+                f"policies.{self.policies.agent}.hidden_sizes",
+                f"{settings.hidden_sizes}, those of Phase 1's policy, which policies start from",
+                policies.agent_of(self.policies)[1].hidden_sizes,
+            )
 
 
 class Problem(NamedTuple):

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 
+from represent_jax.agents.ppo import PpoConfig
 from represent_jax.agents.sac import SacConfig
 from represent_jax.errors import unknown
 from represent_jax.methods.config import RepresentConfig
 from represent_jax.stages.airl import AirlConfig
+from represent_jax.stages.discriminator import DiscriminatorConfig
 from represent_jax.stages.noise import NoiseConfig
 from represent_jax.stages.policies import PoliciesConfig
 from represent_jax.stages.regression import RegressionConfig
@@ -20,6 +22,7 @@ def _smoke(env: str) -> RepresentConfig:
         warmup_env_steps=8,
         hidden_sizes=(8, 8),
     )
+    tiny_ppo = PpoConfig(num_envs=4, unroll_length=5, num_minibatches=2, hidden_sizes=(8, 8))
     return RepresentConfig(
         env=env,
         preset="smoke",
@@ -27,10 +30,11 @@ def _smoke(env: str) -> RepresentConfig:
         airl=AirlConfig(
             env_steps=160,
             cloning_updates=5,
-            hidden_sizes=(8, 8),
-            batch_size=8,
-            updates_per_step=1,
+            discriminator=DiscriminatorConfig(
+                hidden_sizes=(8, 8), batch_size=8, updates_per_step=1
+            ),
             sac=tiny,
+            ppo=tiny_ppo,
         ),
         noise=NoiseConfig(num_levels=5, level_step=0.2, trajectories_per_level=2),
         regression=RegressionConfig(
@@ -43,7 +47,9 @@ def _smoke(env: str) -> RepresentConfig:
             hidden_sizes=(8, 8),
             ensemble_size=2,
         ),
-        policies=PoliciesConfig(env_steps=160, eval_env_steps=40, eval_episodes=2, sac=tiny),
+        policies=PoliciesConfig(
+            env_steps=160, eval_env_steps=40, eval_episodes=2, sac=tiny, ppo=tiny_ppo
+        ),
     )
 
 
@@ -51,7 +57,6 @@ def _quick(env: str) -> RepresentConfig:
     return RepresentConfig(
         env=env,
         preset="quick",
-        regression=RegressionConfig(num_updates=2000, hidden_sizes=(128, 128)),
         policies=PoliciesConfig(env_steps=320_000),
     )
 
@@ -60,8 +65,7 @@ def _paper(env: str) -> RepresentConfig:
     return RepresentConfig(
         env=env,
         preset="paper",
-        airl=AirlConfig(env_steps=320_000),
-        regression=RegressionConfig(num_updates=6000, ensemble_size=3),
+        regression=RegressionConfig(ensemble_size=5),
         policies=PoliciesConfig(env_steps=1_000_000),
     )
 

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from represent_jax.agents import sac
+from represent_jax.agents.sac import PolicyParams
 from represent_jax.data.trajectories import Demonstrations, Trajectory, TrajectoryBatch, pad
 from represent_jax.envs import Episode
-from represent_jax.errors import RepresentError
+from represent_jax.errors import RepresentError, unknown
 from represent_jax.methods import results as found
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.population import Population, stack
@@ -23,13 +23,16 @@ from represent_jax.runs.loop import advance
 from represent_jax.stages import airl, curve, noise, policies, regression
 from represent_jax.types import Transition
 
+STAGES = ("airl", "noise", "regression", "policies", "evaluation")
+
 
 def run(
     config: RepresentConfig,
     problem: Problem,
     directory: RunDirectory,
     checkpoint_seconds: float = 60.0,
-) -> dict[str, Any]:
+    until: str = STAGES[-1],
+) -> dict[str, Any] | None:
     """Runs every stage that is not done yet and returns the results.
 
     Args:
@@ -37,17 +40,24 @@ def run(
       problem: environment, demonstrations, test trajectories.
       directory: where stages are saved as they end, and restored from.
       checkpoint_seconds: least time between two checkpoints of a stage under way.
+      until: the last of `STAGES` to run; called again, the run goes on behind it.
+
+    Returns:
+      The results, None where the run stopped before its evaluation.
+
+    Raises:
+      UsageError: no stage of that name.
+      RepresentError: a loss diverged, or Phase 1's reward is not finite.
     """
-    keys = dict(
-        zip(
-            ("airl", "noise", "regression", "policies", "evaluation"),
-            jax.random.split(jax.random.PRNGKey(config.seed), 5),
-            strict=True,
-        )
-    )
+    if until not in STAGES:
+        raise unknown("stage", until, STAGES)
+    stage_keys = jax.random.split(jax.random.PRNGKey(config.seed), len(STAGES))
+    keys = dict(zip(STAGES, stage_keys, strict=True))
     clock = _Clock(directory)
     with clock("airl"):
         first = run_airl(keys["airl"], config, problem, directory, checkpoint_seconds)
+    if until == "airl":
+        return None
     with clock("noise"):
         noisy = run_noise(keys["noise"], config, problem, first, directory)
     curves = jax.jit(
@@ -56,14 +66,20 @@ def run(
         )
     )(noisy.levels, noisy.returns)
     _check_curves(curves)
+    if until == "noise":
+        return None
     with clock("regression"):
         rewards = run_regression(
             keys["regression"], config, problem, noisy, curves, directory, checkpoint_seconds
         )
+    if until == "regression":
+        return None
     with clock("policies"):
         trained = run_policies(
             keys["policies"], config, problem, first, rewards, directory, checkpoint_seconds
         )
+    if until == "policies":
+        return None
     with clock("evaluation"):
         results = found.evaluate(
             keys["evaluation"], config, problem, first, noisy, curves, rewards, trained, directory
@@ -114,7 +130,7 @@ def run_airl(
 ) -> airl.AirlOutput:
     """Phase 1 for all strategies; leaves of the result are `[num_strategies, ...]`."""
     members = transitions_of(problem.demonstrations)
-    population = Population(members, config.population, _airl_axes)
+    population = Population(members, config.population, airl.population_axes)
 
     def init(key, demonstrations):
         return airl.init(key, problem.env, demonstrations, config.airl)
@@ -123,14 +139,11 @@ def run_airl(
         example = airl.finish(jax.eval_shape(init, key, members[0]))
         example = jax.tree.map(lambda x: _shape_like(x, len(members)), example)
         return directory.load_output("airl", example)
-    chunk_env_steps = _chunk(config.airl.env_steps, config.airl.sac.num_envs)
+    per_step = airl.generator(config.airl)[1].env_steps_per_step
+    chunk_env_steps = _chunk(config.airl.env_steps, per_step)
     step = population.stepper(
         lambda state, demonstrations: airl.train(
-            state,
-            problem.env,
-            demonstrations,
-            config.airl,
-            chunk_env_steps // config.airl.sac.num_envs,
+            state, problem.env, demonstrations, config.airl, chunk_env_steps // per_step
         )
     )
     states = advance(
@@ -146,10 +159,6 @@ def run_airl(
     output = stack([airl.finish(state) for state in population.members(states)])
     directory.save_output("airl", output)
     return output
-
-
-def _airl_axes(state: airl.AirlState) -> airl.AirlState:
-    return jax.tree.map(lambda _: 0, state).replace(sac=sac.population_axes(state.sac))
 
 
 def transitions_of(demonstrations: Demonstrations) -> list[Transition]:
@@ -195,7 +204,7 @@ def run_noise(
     env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
 
     def policy(params, obs_t, key):
-        return sac.act(params, obs_t, key, config.airl.sac, env.action_size)
+        return airl.act(params, obs_t, key, config.airl, env.action_size)
 
     def reward(params, obs_t, action_t, next_obs_t):
         return airl.reward(params, obs_t, action_t, next_obs_t, config.airl)
@@ -282,10 +291,11 @@ def run_policies(
     rewards: regression.Rewards,
     directory: RunDirectory,
     checkpoint_seconds: float,
-) -> sac.PolicyParams:
+) -> PolicyParams:
     """Policies on R^0 and every R^i; leaves of the result are `[1 + num_strategies, ...]`."""
     env, num_strategies = problem.env, problem.demonstrations.num_strategies
     learning = (config.policies, config.regression)
+    agent, settings = policies.agent_of(config.policies)
     key_start, key = jax.random.split(key)
     targets = [
         policies.make_target(rewards, strategy, env, *learning)
@@ -298,18 +308,18 @@ def run_policies(
 
     if directory.is_done("policies"):
         state = jax.eval_shape(init, key, (targets[0], starts[0]))
-        example = sac.policy_of(state.learner)
+        example = agent.policy_of(state.learner)
         return directory.load_output(
             "policies", jax.tree.map(lambda x: _shape_like(x, len(targets)), example)
         )
     task_start = _best_start(key_start, env, targets[0], starts, config)
     members = list(zip(targets, [starts[task_start], *starts], strict=True))
-    population = Population(members, config.population, sac.population_axes)
+    population = Population(members, config.population, agent.population_axes)
     step = population.stepper(
         lambda state, member: policies.train(state, env, member[0], *learning)
     )
-    num_envs = config.policies.sac.num_envs
-    chunk_env_steps = max(1, config.policies.eval_env_steps // num_envs) * num_envs
+    per_step = settings.env_steps_per_step
+    chunk_env_steps = max(1, config.policies.eval_env_steps // per_step) * per_step
     states = advance(
         directory,
         "policies",
@@ -320,7 +330,7 @@ def run_policies(
         checkpoint_seconds=checkpoint_seconds,
         describe=lambda m: "learned return " + _numbers(m["learned_return"]),
     )
-    output = stack([sac.policy_of(state.learner) for state in population.members(states)])
+    output = stack([agent.policy_of(state.learner) for state in population.members(states)])
     directory.save_output("policies", output)
     return output
 
@@ -329,7 +339,7 @@ def _best_start(
     key: jax.Array,
     env: Episode,
     task: policies.Target,
-    starts: list[sac.PolicyParams],
+    starts: list[PolicyParams],
     config: RepresentConfig,
 ) -> int:
     """Index of the Phase 1 policy with the highest learned task return."""
@@ -343,9 +353,9 @@ def _best_start(
     return int(np.argmax([float(score(policy)) for policy in starts]))
 
 
-def _chunk(env_steps: int, num_envs: int) -> int:
+def _chunk(env_steps: int, per_step: int) -> int:
     """Environment steps between two host round trips: a twentieth of the budget."""
-    return max(1, env_steps // 20 // num_envs) * num_envs
+    return max(1, env_steps // 20 // per_step) * per_step
 
 
 def _shape_like(leaf: Any, num_members: int) -> jax.ShapeDtypeStruct:

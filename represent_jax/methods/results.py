@@ -10,12 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from represent_jax.agents import rollout as rollouts
-from represent_jax.agents import sac
+from represent_jax.agents.sac import PolicyParams
 from represent_jax.data.trajectories import pad
 from represent_jax.envs import Episode
 from represent_jax.methods.config import Problem, RepresentConfig, target_names
 from represent_jax.runs import RunDirectory, provenance
 from represent_jax.stages import airl, curve, evaluation, noise, policies, regression, style
+
+# Episodes behind every return that a run reports.
+FINAL_EPISODES = 10
 
 
 def evaluate(
@@ -26,7 +29,7 @@ def evaluate(
     noisy: noise.NoisyData,
     curves: curve.Curve,
     rewards: regression.Rewards,
-    trained: sac.PolicyParams,
+    trained: PolicyParams,
     directory: RunDirectory,
 ) -> dict[str, Any]:
     """Compares rewards and policies with the truth, saves plot data, and returns the results."""
@@ -84,9 +87,9 @@ def _airl_returns(
 
     def one(key, policy):
         def act(params, obs_t, key):
-            return sac.act(params, obs_t, key, config.airl.sac, env.action_size)
+            return airl.act(params, obs_t, key, config.airl, env.action_size)
 
-        batch = rollouts.rollout(env, act, policy, key, jnp.zeros(10))
+        batch = rollouts.rollout(env, act, policy, key, jnp.zeros(FINAL_EPISODES))
         return jnp.mean(rollouts.true_returns(batch))
 
     keys = jax.random.split(key, problem.demonstrations.num_strategies)
@@ -169,39 +172,35 @@ def _policy_results(
     config: RepresentConfig,
     problem: Problem,
     rewards: regression.Rewards,
-    trained: sac.PolicyParams,
+    trained: PolicyParams,
     classifier: style.StyleClassifier,
     demo_means: list[float],
     directory: RunDirectory,
 ) -> dict[str, Any]:
-    env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
+    @jax.jit
+    def final(key, policy, reward_target):
+        batch, result = policies.rollout(
+            key,
+            problem.env,
+            reward_target,
+            policy,
+            FINAL_EPISODES,
+            config.policies,
+            config.regression,
+        )
+        posterior = jnp.exp(style.log_posterior(classifier, batch.obs[:, 1:]))
+        share = jnp.sum(posterior * batch.mask[..., None], axis=(0, 1)) / jnp.sum(batch.mask)
+        return result, share
+
     log = directory.read_log("policies")
     results, curves = {}, {}
     for target, name in enumerate(target_names(len(demo_means))):
         strategy = target - 1 if target else None
         reward_target = policies.make_target(
-            rewards, strategy, env, config.policies, config.regression
+            rewards, strategy, problem.env, config.policies, config.regression
         )
         policy = jax.tree.map(lambda x, target=target: x[target], trained)
-
-        @jax.jit
-        def final(key, policy, reward_target):
-            def act(params, obs_t, key):
-                return sac.act(
-                    params, obs_t, key, config.policies.sac, env.action_size, deterministic=True
-                )
-
-            batch = rollouts.rollout(env, act, policy, key, jnp.zeros(10))
-            learned = rollouts.learned_returns(
-                batch,
-                lambda *args: policies.learned_reward(*args, config.regression),
-                reward_target,
-            )
-            posterior = jnp.exp(style.log_posterior(classifier, batch.obs[:, 1:]))
-            share = jnp.sum(posterior * batch.mask[..., None], axis=(0, 1)) / jnp.sum(batch.mask)
-            return rollouts.true_returns(batch), learned, share
-
-        true, learned, share = final(jax.random.fold_in(key, target), policy, reward_target)
+        (true, learned), share = final(jax.random.fold_in(key, target), policy, reward_target)
         path = {
             "env_steps": [line["step"] for line in log],
             "true_return": [line["true_return"][target] for line in log],

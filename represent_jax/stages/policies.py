@@ -1,4 +1,4 @@
-"""Policies on learned rewards: SAC on R^0 and on every R^i.
+"""Policies on learned rewards: SAC, or PPO, on R^0 and on every R^i.
 
 The learned reward is used in the unit rho = R * horizon / S, less `center`: a noise-free episode
 of Phase 1 then earns about nothing, and an agent that starts from Phase 1's policy is paid only
@@ -7,15 +7,18 @@ networks, SAC finds local optima of the same reward below what running well woul
 """
 
 import dataclasses
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from represent_jax.agents import rollout as rollouts
-from represent_jax.agents import sac
-from represent_jax.agents.sac import SacConfig
+from represent_jax.agents.ppo import PpoConfig
+from represent_jax.agents.registry import find_agent
+from represent_jax.agents.sac import PolicyParams, SacConfig
 from represent_jax.config import require
+from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.envs.episode import Episode
 from represent_jax.stages import regression
 from represent_jax.stages.regression import RegressionConfig
@@ -28,15 +31,17 @@ class PoliciesConfig:
 
     Attributes:
       env_steps: budget of each target.
+      agent: "sac" or "ppo".
       start: "phase1" starts from Phase 1's policy, "cold" from random networks.
       center: subtracted from rho at every step, unless episodes can end early: there a negative
         reward would pay for ending them.
       eval_env_steps: environment steps between two evaluations.
       eval_episodes: deterministic episodes of an evaluation.
-      sac: the agent.
+      sac, ppo: the agents.
     """
 
     env_steps: int = 400_000
+    agent: str = "sac"
     start: str = "phase1"
     center: float = 1.0
     eval_env_steps: int = 20_000
@@ -47,11 +52,18 @@ class PoliciesConfig:
         warmup_env_steps=19_200,
         critic_warmup_updates=2_000,
     )
+    ppo: PpoConfig = PpoConfig()
 
     def __post_init__(self) -> None:
+        find_agent(self.agent)
         require(self.start in ("phase1", "cold"), "start", "'phase1' or 'cold'", self.start)
         for field in ("env_steps", "eval_env_steps", "eval_episodes"):
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
+
+
+def agent_of(config: PoliciesConfig) -> tuple[ModuleType, SacConfig | PpoConfig]:
+    """The agent's module and settings."""
+    return find_agent(config.agent), getattr(config, config.agent)
 
 
 class Target(NamedTuple):
@@ -74,8 +86,8 @@ class Evaluation(NamedTuple):
     """Deterministic episodes of a policy.
 
     Attributes:
-      true_return: mean return under the environment's reward, `[]`.
-      learned_return: mean return under the learned reward, `[]`.
+      true_return: return under the environment's reward, `[]` where averaged.
+      learned_return: return under the learned reward, `[]` where averaged.
     """
 
     true_return: jax.Array
@@ -132,15 +144,16 @@ def init(
     key: jax.Array,
     env: Episode,
     target: Target,
-    policy: sac.PolicyParams,
+    policy: PolicyParams,
     config: PoliciesConfig,
     regression_config: RegressionConfig,
-) -> sac.SacState:
+) -> Any:
     """Starts an agent on a target, from `policy` unless the start is cold."""
-    return sac.init(
+    agent, settings = agent_of(config)
+    return agent.init(
         key,
         env,
-        config.sac,
+        settings,
         policy_params=policy if config.start == "phase1" else None,
         reward_fn=lambda *args: reward(*args, regression_config),
         reward_params=target,
@@ -148,24 +161,25 @@ def init(
 
 
 def train(
-    state: sac.SacState,
+    state: Any,
     env: Episode,
     target: Target,
     config: PoliciesConfig,
     regression_config: RegressionConfig,
-) -> tuple[sac.SacState, Metrics]:
+) -> tuple[Any, Metrics]:
     """Trains for `eval_env_steps` and evaluates."""
-    num_steps = max(1, config.eval_env_steps // config.sac.num_envs)
-    state, metrics = sac.train(
+    agent, settings = agent_of(config)
+    num_steps = max(1, config.eval_env_steps // settings.env_steps_per_step)
+    state, metrics = agent.train(
         state,
         env,
-        config.sac,
+        settings,
         num_steps,
         reward_fn=lambda *args: reward(*args, regression_config),
         reward_params=target,
     )
     key_eval, key = jax.random.split(state.key)
-    policy = sac.policy_of(state.learner)
+    policy = agent.policy_of(state.learner)
     result = evaluate(key_eval, env, target, policy, config, regression_config)
     return state.replace(key=key), {**metrics, **result._asdict()}
 
@@ -174,18 +188,33 @@ def evaluate(
     key: jax.Array,
     env: Episode,
     target: Target,
-    policy: sac.PolicyParams,
+    policy: PolicyParams,
     config: PoliciesConfig,
     regression_config: RegressionConfig,
 ) -> Evaluation:
     """Runs deterministic episodes; the true return is only ever reported, never used."""
+    _, result = rollout(key, env, target, policy, config.eval_episodes, config, regression_config)
+    return jax.tree.map(jnp.mean, result)
+
+
+def rollout(
+    key: jax.Array,
+    env: Episode,
+    target: Target,
+    policy: PolicyParams,
+    num_episodes: int,
+    config: PoliciesConfig,
+    regression_config: RegressionConfig,
+) -> tuple[TrajectoryBatch, Evaluation]:
+    """Runs deterministic episodes; returns them and both returns of each, `[num_episodes]`."""
     whole = Episode(env.env, env.horizon, auto_reset=False)
+    agent, settings = agent_of(config)
 
     def act(params, obs_t, key):
-        return sac.act(params, obs_t, key, config.sac, env.action_size, deterministic=True)
+        return agent.act(params, obs_t, key, settings, env.action_size, deterministic=True)
 
-    batch = rollouts.rollout(whole, act, policy, key, jnp.zeros(config.eval_episodes))
+    batch = rollouts.rollout(whole, act, policy, key, jnp.zeros(num_episodes))
     learned = rollouts.learned_returns(
         batch, lambda *args: learned_reward(*args, regression_config), target
     )
-    return Evaluation(jnp.mean(rollouts.true_returns(batch)), jnp.mean(learned))
+    return batch, Evaluation(rollouts.true_returns(batch), learned)

@@ -52,7 +52,8 @@ class RegressionConfig:
       hidden_sizes: units of the hidden layers of every head.
       learning_rate: Adam's step size.
       kernel_scale: standard deviation of initial kernels (SSRR: 0.001).
-      l2: weight of the squared kernels (SSRR: 0.1).
+      l2: weight of R^0's squared kernels (SSRR: 0.1).
+      strategy_l2: weight of those of every R~^i, which Eq. 4 keeps small already.
       ensemble_size: independent copies, whose mean is the reward.
       return_scale: learned return of a whole episode whose curve value is 1 (SSRR: 10).
       strategy_weight: alpha_i of Eq. 1, for all strategies.
@@ -62,17 +63,18 @@ class RegressionConfig:
       include_action: whether rewards see state and action as well as the next state.
     """
 
-    num_updates: int = 3000
+    num_updates: int = 2000
     num_snippets: int = 64
     states_per_snippet: int = 16
     num_demonstration_states: int = 256
     min_snippet_steps: int = 50
     max_snippet_steps: int = 500
-    hidden_sizes: tuple[int, ...] = (256, 256)
+    hidden_sizes: tuple[int, ...] = (128, 128)
     learning_rate: float = 1e-4
     kernel_scale: float = 1e-3
     l2: float = 0.1
-    ensemble_size: int = 1
+    strategy_l2: float = 0.01
+    ensemble_size: int = 3
     return_scale: float = 10.0
     strategy_weight: float = 1.0
     lambda_ssrr: float = 1.0
@@ -318,12 +320,10 @@ def loss(
     reg = jnp.sum(jnp.mean(jnp.square(rho_own), axis=(1, 2)))
     reg += jnp.sum(jnp.mean(jnp.square(rho_cross), axis=(1, 2)))
     bcd = discrimination_loss(utility, config)
-    l2 = sum(jnp.sum(jnp.square(kernel)) for kernel in _kernels(rewards))
+    l2 = config.l2 * _squared_kernels(rewards.task)
+    l2 += config.strategy_l2 * _squared_kernels(rewards.strategies)
     total = (
-        config.lambda_ssrr * jnp.sum(ssrr)
-        + config.lambda_reg * reg
-        + config.lambda_bcd * bcd
-        + config.l2 * l2
+        config.lambda_ssrr * jnp.sum(ssrr) + config.lambda_reg * reg + config.lambda_bcd * bcd + l2
     )
     own = jnp.diagonal(jnp.mean(rho_cross, axis=-1))
     others = jnp.sum(jnp.mean(rho_cross, axis=-1)) - jnp.sum(own)
@@ -339,9 +339,9 @@ def loss(
     return total, metrics
 
 
-def _kernels(rewards: Rewards) -> list[jax.Array]:
-    leaves = jax.tree_util.tree_leaves_with_path(rewards)
-    return [leaf for path, leaf in leaves if path[-1].key == "kernel"]
+def _squared_kernels(params: Params) -> jax.Array:
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    return sum(jnp.sum(jnp.square(leaf)) for path, leaf in leaves if path[-1].key == "kernel")
 
 
 def _sample_states(key: jax.Array, batch: TrajectoryBatch, config: RegressionConfig) -> jax.Array:

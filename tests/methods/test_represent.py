@@ -108,9 +108,39 @@ def test_finished_run_is_not_run_again(finished, cache):
     assert [line for line in _log(out) if line["stage"] != "clock"] == before
 
 
-def test_pipeline_on_the_c_engine(tmp_path):
-    _finish(_launch(tmp_path / "c", "--backend=mujoco", "--env=hopper"))
-    assert _results(tmp_path / "c")["backend"] == "mujoco"
+def test_pipeline_on_the_c_engine_in_two_parts(tmp_path):
+    out, flags = tmp_path / "c", ("--backend=mujoco", "--env=hopper")
+    output = _finish(_launch(out, *flags, "--until=noise"))
+    assert "done until noise" in output
+    assert not (out / "results.json").exists()
+    assert {line["stage"] for line in _log(out)} == {"airl", "clock"}
+    _finish(_launch(out, *flags, "--resume"))
+    assert _results(out)["backend"] == "mujoco"
+
+
+def test_pipeline_with_ppo_throughout(tmp_path):
+    out = tmp_path / "ppo"
+    _finish(
+        _launch(
+            out, "--backend=mujoco", "--override=airl.agent=ppo", "--override=policies.agent=ppo"
+        )
+    )
+    assert np.isfinite(_results(out)["policies"]["task"]["return_final"])
+    assert rj.load_policy(out)(np.zeros((2, 17), np.float32)).shape == (2, 6)
+
+
+def test_evaluate_judges_a_finished_run(finished):
+    out, _, _ = finished
+    command = [sys.executable, "-m", "experiments.evaluate", f"--run={out}", "--backend=mujoco"]
+    shown = subprocess.run(
+        [*command, "--episodes=2"], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
+    assert shown.returncode == 0, shown.stderr
+    by_target = {line.split("  ")[0]: line.split() for line in shown.stdout.splitlines()}
+    found = _results(out)["rewards"]["task"]["pearson_test"]
+    # The run's own test trajectories are cut to its tiny horizon, these are whole.
+    assert -1.0 <= float(by_target["Task"][1]) <= 1.0 and np.isfinite(found)
+    assert {"Task", "Strategy 1", "Strategy 2"} <= set(by_target)
 
 
 def test_loaded_reward_and_policy(finished):
@@ -139,6 +169,7 @@ def test_reward_of_an_unfinished_run_is_an_error(tmp_path):
     [
         ("--env=halfcheetah", "half_cheetah"),
         ("--preset=smok", "smoke"),
+        ("--until=nois", "noise"),
         ("--backend=mjxx", "mjx"),
         ("--override=airl.env_step=10", "airl.env_steps"),
         ("--override=num_strategies=9", "num_strategies"),

@@ -1,0 +1,90 @@
+"""Judges a run's rewards on trajectories of your choice, and its policies in fresh episodes.
+
+python -m experiments.evaluate --run=runs/demo
+python -m experiments.evaluate --run=runs/demo --trajectories=mine.npz --noise_level=0.1
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from absl import flags
+
+from experiments import launch
+from represent_jax.agents import rollout
+from represent_jax.api import load_config, load_policy, load_reward
+from represent_jax.data.catalogue import load_demonstrations
+from represent_jax.data.trajectories import pad
+from represent_jax.envs import Episode, make_env
+from represent_jax.methods.config import target_names
+from represent_jax.report import tables
+from represent_jax.report.values import display_name, format_number
+from represent_jax.runs import RunDirectory
+from represent_jax.stages import evaluation
+
+_RUN = flags.DEFINE_string("run", None, "Run folder.", required=True)
+_TRAJECTORIES = flags.DEFINE_string(
+    "trajectories", "", "Name or npz file of trajectories; the environment's test set if empty."
+)
+_EPISODES = flags.DEFINE_integer("episodes", 10, "Episodes of each policy.", lower_bound=1)
+_NOISE_LEVEL = flags.DEFINE_float(
+    "noise_level",
+    0.0,
+    "Share of random actions.",
+    lower_bound=0.0,
+    upper_bound=1.0,
+)
+_SEED = flags.DEFINE_integer("seed", 0, "Seed of the episodes.")
+_BACKEND = flags.DEFINE_string("backend", None, "Physics engine; that of the run if not given.")
+
+
+def main(argv: list[str]) -> None:
+    launch.refuse_arguments(argv)
+    config = load_config(_RUN.value)
+    reward = load_reward(_RUN.value)
+    env = make_env(config.env, _BACKEND.value or config.backend)
+    env = Episode(env, config.horizon or env.horizon, auto_reset=False)
+    data = load_demonstrations(_TRAJECTORIES.value or f"{config.env}_test")
+    data.check_against(env.observation_size, env.action_size, -1.0, 1.0)
+    batch = pad(data.trajectories, max(t.length for t in data.trajectories))
+    targets = target_names(config.num_strategies)
+    has_policies = RunDirectory(_RUN.value).is_done("policies")
+    rows = []
+    for target in targets:
+
+        def learned(_, *transition, target=target):
+            return reward(*transition, target=target)
+
+        returns = rollout.learned_returns(batch, learned, None)
+        found = evaluation.correlate(rollout.true_returns(batch), returns)
+        row = [display_name(target), *(format_number(float(x), 3) for x in found)]
+        if has_policies:
+            policy = load_policy(_RUN.value, target)
+            episodes = jax.jit(
+                lambda key, policy=policy: rollout.rollout(
+                    env,
+                    lambda _, obs_t, key: policy(obs_t),
+                    None,
+                    key,
+                    jnp.full(_EPISODES.value, _NOISE_LEVEL.value),
+                )
+            )(jax.random.PRNGKey(_SEED.value))
+            for values in (
+                rollout.true_returns(episodes),
+                rollout.learned_returns(episodes, learned, None),
+            ):
+                row += [format_number(float(np.mean(values))), format_number(float(np.std(values)))]
+        rows.append(tuple(row))
+    columns = ("target", "Pearson", "Spearman")
+    if has_policies:
+        columns += ("true return", "std", "learned return", "std")
+    table = tables.Table(
+        title=f"{len(data.trajectories)} trajectories, {_EPISODES.value} episodes of each policy",
+        columns=columns,
+        rows=tuple(rows),
+        note="",
+    )
+    print(tables.to_text(table))
+
+
+if __name__ == "__main__":
+    launch.run(main)
