@@ -295,7 +295,7 @@ def run_policies(
     """Policies on R^0 and every R^i; leaves of the result are `[1 + num_strategies, ...]`."""
     env, num_strategies = problem.env, problem.demonstrations.num_strategies
     learning = (config.policies, config.regression)
-    agent, settings = policies.agent_of(config.policies)
+    _, settings = policies.agent_of(config.policies)
     key_start, key = jax.random.split(key)
     targets = [
         policies.make_target(rewards, strategy, env, *learning)
@@ -308,13 +308,15 @@ def run_policies(
 
     if directory.is_done("policies"):
         state = jax.eval_shape(init, key, (targets[0], starts[0]))
-        example = agent.policy_of(state.learner)
+        example = policies.finish(state, config.policies)
         return directory.load_output(
             "policies", jax.tree.map(lambda x: _shape_like(x, len(targets)), example)
         )
     task_start = _best_start(key_start, env, targets[0], starts, config)
     members = list(zip(targets, [starts[task_start], *starts], strict=True))
-    population = Population(members, config.population, agent.population_axes)
+    population = Population(
+        members, config.population, lambda state: policies.population_axes(state, config.policies)
+    )
     step = population.stepper(
         lambda state, member: policies.train(state, env, member[0], *learning)
     )
@@ -330,7 +332,9 @@ def run_policies(
         checkpoint_seconds=checkpoint_seconds,
         describe=lambda m: "learned return " + _numbers(m["learned_return"]),
     )
-    output = stack([agent.policy_of(state.learner) for state in population.members(states)])
+    output = stack(
+        [policies.finish(state, config.policies) for state in population.members(states)]
+    )
     directory.save_output("policies", output)
     return output
 

@@ -105,7 +105,7 @@ def _curve_results(fitted: curve.Curve) -> dict[str, Any]:
         "r2": float(fitted.r2),
         "status": curve.CurveStatus(int(fitted.status)).name.lower(),
         "levels": np.asarray(fitted.levels).tolist(),
-        "means": np.asarray(fitted.scaled_means).tolist(),
+        "returns": np.asarray(fitted.scaled_returns).tolist(),
         "fitted": np.asarray(fitted.fitted).tolist(),
     }
 
@@ -213,6 +213,7 @@ def _policy_results(
         results[name] = {
             "return_final": final_return,
             "return_final_std": float(np.std(true)),
+            "return_last": path["true_return"][-1],
             "return_best": max([*path["true_return"], final_return]),
             "learned_return_final": float(np.mean(learned)),
             "demonstrators_return": base,

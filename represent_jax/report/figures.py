@@ -145,18 +145,18 @@ def _panels(
 
 def _draw_noise_curve(ax: Axes, target: str, curve: Mapping[str, Any]) -> None:
     levels = _numbers(curve.get("levels"))
-    means = _numbers(curve.get("means"))
+    returns = _numbers(curve.get("returns"))
     fitted = _numbers(curve.get("fitted"))
     falls = curve.get("status") in ("converged", "max_iterations")
     ax.plot(
         levels,
-        means,
+        returns,
         "o",
         ms=5.5,
         mfc="white",
         mec=colour(target),
         mew=1.5,
-        label="mean of the rollouts",
+        label="rollouts",
         zorder=3,
     )
     if fitted.size and np.all(np.isfinite(fitted)):
@@ -179,7 +179,7 @@ def _dense(
         return levels, fitted
     eta = np.linspace(levels[0], levels[-1], 200)
     x0, y0, c, k = (np.float32(parameter) for parameter in parameters)
-    rest = dict(scaled_means=fitted, r2=np.float32(1.0), status=np.int32(CurveStatus.CONVERGED))
+    rest = dict(scaled_returns=fitted, r2=np.float32(1.0), status=np.int32(CurveStatus.CONVERGED))
     levels, fitted = levels.astype(np.float32), fitted.astype(np.float32)
     found = Curve(x0=x0, y0=y0, c=c, k=k, levels=levels, fitted=fitted, **rest)
     return eta, np.asarray(evaluate(found, eta.astype(np.float32)))

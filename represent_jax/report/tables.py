@@ -78,7 +78,7 @@ def returns_table(results: Mapping[str, Any]) -> Table | None:
             "target",
             "demonstrators",
             "imitation",
-            "final",
+            "kept",
             "best",
             "vs demos",
             "learned",
@@ -87,10 +87,10 @@ def returns_table(results: Mapping[str, Any]) -> Table | None:
         rows=tuple(rows),
         note="Mean episode return under the environment's own reward, which the method never sees, "
         "of the demonstrators (the task's are all of them), of their imitation, and of the policy "
-        "trained on the learned reward: the final one, and the best met along the way. Vs demos: "
-        "final over demonstrators. Learned: the final policy's return under the learned reward, in "
-        "its own units. Style: share of states in which a strategy's policy is still recognised "
-        "as that strategy.",
+        "trained on the learned reward: the one kept for its learned return, and the best met "
+        "along the way. Vs demos: kept over demonstrators. Learned: the kept policy's return under "
+        "the learned reward, in its own units. Style: share of states in which a strategy's policy "
+        "is still recognised as that strategy.",
     )
 
 

@@ -53,7 +53,7 @@ _SENTENCES = {
     ),
     CurveStatus.NOT_FALLING: (
         "the returns do not fall along a sigmoid as noise grows; "
-        "a monotone (isotonic) fit of the means is used instead"
+        "a monotone (isotonic) fit is used instead"
     ),
     CurveStatus.NON_FINITE: "the returns hold NaN or infinity; there is no curve",
 }
@@ -69,6 +69,8 @@ class CurveConfig:
     """Settings of the curve fit.
 
     Attributes:
+        statistic: what stands for the trajectories of a level: their "median", which one fallen
+            robot does not move, or the "mean" of the paper.
         num_iterations: Levenberg-Marquardt iterations of every start.
         steepest: largest -k, per unit of noise level.
         flattest: smallest -k; above zero, so that the sigmoid can only fall.
@@ -76,11 +78,12 @@ class CurveConfig:
             sigmoid may lie. At 10 the tail differs from an exponential by less than 1e-4.
         min_r2: smallest R^2 with which the sigmoid is accepted.
         min_drop: smallest fall from the first to the last level, in units of the range of the
-            means, with which the sigmoid is accepted.
+            values, with which the sigmoid is accepted.
         tolerance: a fit counts as converged when a full Gauss-Newton step would lower its sum of
             squares by less than this fraction.
     """
 
+    statistic: str = "median"
     num_iterations: int = 60
     steepest: float = 50.0
     flattest: float = 0.1
@@ -90,6 +93,9 @@ class CurveConfig:
     tolerance: float = 1e-4
 
     def __post_init__(self):
+        require(
+            self.statistic in ("median", "mean"), "statistic", "'median' or 'mean'", self.statistic
+        )
         require(self.num_iterations >= 1, "num_iterations", "at least 1", self.num_iterations)
         require(
             0 < self.flattest < self.steepest <= 100,
@@ -110,7 +116,7 @@ class Curve(NamedTuple):
         x0, y0, c, k: [] parameters of the sigmoid, of the rejected one under NOT_FALLING. Far out
             on a tail c and y0 are huge and cancel: use `evaluate`, not these.
         levels: [L] noise levels, ascending.
-        scaled_means: [L] mean return of each level, min-max scaled to [0, 1].
+        scaled_returns: [L] typical return of each level, min-max scaled to [0, 1].
         fitted: [L] the curve at the levels: the targets of the regression.
         r2: [] coefficient of determination of the sigmoid on the scaled means.
         status: [] int32 CurveStatus.
@@ -121,7 +127,7 @@ class Curve(NamedTuple):
     c: jax.Array
     k: jax.Array
     levels: jax.Array
-    scaled_means: jax.Array
+    scaled_returns: jax.Array
     fitted: jax.Array
     r2: jax.Array
     status: jax.Array
@@ -130,9 +136,9 @@ class Curve(NamedTuple):
 def fit(levels: jax.Array, returns: jax.Array, config: CurveConfig) -> Curve:
     """Fits the noise-performance curve of one strategy; vmap over returns for several.
 
-    The means of each level are min-max scaled to [0, 1] (Chen et al., 2020), so the curve does
+    The medians of each level are min-max scaled to [0, 1] (Chen et al., 2020), so the curve does
     not depend on the units of the learned reward. A sigmoid that does not fall or does not fit is
-    replaced by the decreasing isotonic fit of the means, which the status says.
+    replaced by the decreasing isotonic fit of these values, which the status says.
 
     Args:
         levels: [L] noise levels, ascending.
@@ -146,8 +152,8 @@ def fit(levels: jax.Array, returns: jax.Array, config: CurveConfig) -> Curve:
         RepresentError: if the shapes do not agree or, where levels are concrete, do not ascend.
     """
     levels, returns = _check(levels, returns)
-    means = jnp.mean(returns, axis=1)
-    low, high = jnp.min(means), jnp.max(means)
+    typical = (jnp.median if config.statistic == "median" else jnp.mean)(returns, axis=1)
+    low, high = jnp.min(typical), jnp.max(typical)
     finite = (
         jnp.all(jnp.isfinite(returns)) & jnp.isfinite(high - low) & jnp.all(jnp.isfinite(levels))
     )
@@ -155,7 +161,7 @@ def fit(levels: jax.Array, returns: jax.Array, config: CurveConfig) -> Curve:
     # Equal returns may differ in the last bits of their means, which must not be scaled up.
     rounding = 16 * jnp.finfo(returns.dtype).eps * jnp.max(jnp.abs(returns))
     varied = finite & (high - low > rounding)
-    scaled = jnp.where(varied, (means - low) / jnp.where(varied, high - low, 1.0), 0.0)
+    scaled = jnp.where(varied, (typical - low) / jnp.where(varied, high - low, 1.0), 0.0)
     places = jnp.where(finite, (levels - levels[0]) / (levels[-1] - levels[0]), 0.0)
 
     span = jnp.where(finite, levels[-1] - levels[0], 1.0)
@@ -184,7 +190,7 @@ def fit(levels: jax.Array, returns: jax.Array, config: CurveConfig) -> Curve:
         y0=first - c * jax.nn.sigmoid(z_first),
         c=c,
         k=k,
-        scaled_means=scaled,
+        scaled_returns=scaled,
         fitted=jnp.where(falls, sigmoid, decreasing(scaled)),
         r2=r2,
     )

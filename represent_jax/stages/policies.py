@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from represent_jax.agents import rollout as rollouts
 from represent_jax.agents.ppo import PpoConfig
@@ -33,6 +34,8 @@ class PoliciesConfig:
       env_steps: budget of each target.
       agent: "sac" or "ppo".
       start: "phase1" starts from Phase 1's policy, "cold" from random networks.
+      keep: which policy is handed on: of those evaluated the "best" by learned return, or the
+        "last".
       center: subtracted from rho at every step, unless episodes can end early: there a negative
         reward would pay for ending them.
       eval_env_steps: environment steps between two evaluations.
@@ -43,6 +46,7 @@ class PoliciesConfig:
     env_steps: int = 400_000
     agent: str = "sac"
     start: str = "phase1"
+    keep: str = "best"
     center: float = 1.0
     eval_env_steps: int = 20_000
     eval_episodes: int = 5
@@ -57,6 +61,7 @@ class PoliciesConfig:
     def __post_init__(self) -> None:
         find_agent(self.agent)
         require(self.start in ("phase1", "cold"), "start", "'phase1' or 'cold'", self.start)
+        require(self.keep in ("best", "last"), "keep", "'best' or 'last'", self.keep)
         for field in ("env_steps", "eval_env_steps", "eval_episodes"):
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
 
@@ -73,6 +78,8 @@ class Target(NamedTuple):
       heads: the task's and one strategy's parameters.
       strategy_weight: 0 for R^0, alpha_i for R^i, `[]`.
       scale: horizon / S, which turns R into rho, `[]`.
+      keep: which policy is handed on: of those evaluated the "best" by learned return, or the
+        "last".
       center: subtracted from rho, `[]`.
     """
 
@@ -80,6 +87,21 @@ class Target(NamedTuple):
     strategy_weight: jax.Array
     scale: jax.Array
     center: jax.Array
+
+
+@struct.dataclass
+class PolicyState:
+    """Training state of one target.
+
+    Attributes:
+      agent: the agent's.
+      best: the policy with the highest learned return of those evaluated.
+      best_learned_return: `[]`.
+    """
+
+    agent: Any
+    best: PolicyParams
+    best_learned_return: jax.Array
 
 
 class Evaluation(NamedTuple):
@@ -147,10 +169,10 @@ def init(
     policy: PolicyParams,
     config: PoliciesConfig,
     regression_config: RegressionConfig,
-) -> Any:
+) -> PolicyState:
     """Starts an agent on a target, from `policy` unless the start is cold."""
     agent, settings = agent_of(config)
-    return agent.init(
+    state = agent.init(
         key,
         env,
         settings,
@@ -158,30 +180,52 @@ def init(
         reward_fn=lambda *args: reward(*args, regression_config),
         reward_params=target,
     )
+    # A copy: the state is donated, and two leaves must not share one buffer.
+    best = jax.tree.map(jnp.copy, agent.policy_of(state.learner))
+    return PolicyState(state, best, jnp.float32(-jnp.inf))
 
 
 def train(
-    state: Any,
+    state: PolicyState,
     env: Episode,
     target: Target,
     config: PoliciesConfig,
     regression_config: RegressionConfig,
-) -> tuple[Any, Metrics]:
-    """Trains for `eval_env_steps` and evaluates."""
+) -> tuple[PolicyState, Metrics]:
+    """Trains for `eval_env_steps`, evaluates, and keeps the better policy by learned return."""
     agent, settings = agent_of(config)
     num_steps = max(1, config.eval_env_steps // settings.env_steps_per_step)
-    state, metrics = agent.train(
-        state,
+    agent_state, metrics = agent.train(
+        state.agent,
         env,
         settings,
         num_steps,
         reward_fn=lambda *args: reward(*args, regression_config),
         reward_params=target,
     )
-    key_eval, key = jax.random.split(state.key)
-    policy = agent.policy_of(state.learner)
+    key_eval, key = jax.random.split(agent_state.key)
+    policy = agent.policy_of(agent_state.learner)
     result = evaluate(key_eval, env, target, policy, config, regression_config)
-    return state.replace(key=key), {**metrics, **result._asdict()}
+    better = result.learned_return > state.best_learned_return
+    state = PolicyState(
+        agent=agent_state.replace(key=key),
+        best=jax.tree.map(lambda new, old: jnp.where(better, new, old), policy, state.best),
+        best_learned_return=jnp.maximum(result.learned_return, state.best_learned_return),
+    )
+    return state, {**metrics, **result._asdict()}
+
+
+def finish(state: PolicyState, config: PoliciesConfig) -> PolicyParams:
+    """Reads the policy that is handed on."""
+    if config.keep == "best":
+        return state.best
+    return agent_of(config)[0].policy_of(state.agent.learner)
+
+
+def population_axes(state: PolicyState, config: PoliciesConfig) -> PolicyState:
+    """Returns vmap axes for a stacked state: 0 everywhere but for the agent's counters."""
+    agent, _ = agent_of(config)
+    return PolicyState(agent.population_axes(state.agent), best=0, best_learned_return=0)
 
 
 def evaluate(

