@@ -46,7 +46,7 @@ def main(argv: list[str]) -> None:
     data = load_demonstrations(_TRAJECTORIES.value or f"{config.env}_test")
     data.check_against(env.observation_size, env.action_size, -1.0, 1.0)
     batch = pad(data.trajectories, max(t.length for t in data.trajectories))
-    targets = target_names(config.num_strategies)
+    targets = target_names(config)
     has_policies = RunDirectory(_RUN.value).is_done("policies")
     rows = []
     for target in targets:

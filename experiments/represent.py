@@ -1,4 +1,4 @@
-"""Runs REPRESENT: from demonstrations to rewards, policies and a report.
+"""Runs REPRESENT, or SSRR: from demonstrations to rewards, policies and a report.
 
 python -m experiments.represent --env=half_cheetah --preset=quick --out=runs/demo
 python -m experiments.represent --env=hopper --seed=1 --override policies.env_steps=200000
@@ -17,11 +17,13 @@ from represent_jax.envs import make_env
 from represent_jax.methods import represent
 from represent_jax.methods.config import RepresentConfig, make_problem
 from represent_jax.methods.presets import make_config
+from represent_jax.methods.registry import METHODS, configure
 from represent_jax.report import html, tables
 from represent_jax.runs import open_run
 from represent_jax.runs.records import append_results
 
 _ENV = flags.DEFINE_string("env", "half_cheetah", "Environment.")
+_METHOD = flags.DEFINE_string("method", "represent", f"One of {', '.join(METHODS)}.")
 _PRESET = flags.DEFINE_string("preset", "quick", "Settings to begin with: smoke, quick or paper.")
 _SEED = flags.DEFINE_integer("seed", 0, "Seed of everything after the demonstrations.")
 _NUM_SEEDS = flags.DEFINE_integer("num_seeds", 1, "Number of seeds, from --seed on, in turn.")
@@ -29,7 +31,9 @@ _BACKEND = flags.DEFINE_string("backend", "auto", "Physics engine: auto, mujoco 
 _DEMONSTRATIONS = flags.DEFINE_string(
     "demonstrations", "", "Name or npz file of demonstrations; the environment's own if empty."
 )
-_OUT = flags.DEFINE_string("out", None, "Run folder; runs/<env>-<preset>-<seed> if not given.")
+_OUT = flags.DEFINE_string(
+    "out", None, "Run folder; runs/<env>-<method>-<preset>-<seed> if not given."
+)
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting as dotted.key=value; repeatable.")
 _RESUME = flags.DEFINE_bool("resume", False, "Go on with the run in the folder.")
 _UNTIL = flags.DEFINE_string(
@@ -50,8 +54,8 @@ def main(argv: list[str]) -> None:
             backend=_BACKEND.value,
             demonstrations=_DEMONSTRATIONS.value,
         )
-        config = configs.apply_overrides(config, _OVERRIDE.value)
-        out = _OUT.value or f"runs/{config.env}-{config.preset}-{seed}"
+        config = configs.apply_overrides(configure(_METHOD.value, config), _OVERRIDE.value)
+        out = _OUT.value or f"runs/{config.env}-{config.method}-{config.preset}-{seed}"
         if _OUT.value and _NUM_SEEDS.value > 1:
             out = f"{_OUT.value}/seed_{seed}"
         _run(config, out)
@@ -66,7 +70,7 @@ def _run(config: RepresentConfig, out: str) -> None:
         load_demonstrations(f"{config.env}_test"),
     )
     print(json.dumps(configs.to_dict(config), indent=2))
-    if problem.demonstrations.num_strategies == 1:
+    if problem.demonstrations.num_strategies == 1 and config.method == "represent":
         print("one strategy alone: the rewards are learned, but nothing is decomposed")
     with open_run(out, config, resume=_RESUME.value) as run:
         results = represent.run(config, problem, run, _CHECKPOINT_SECONDS.value, _UNTIL.value)
@@ -77,7 +81,7 @@ def _run(config: RepresentConfig, out: str) -> None:
     print(tables.summary(results))
     print(f"report: {page}")
     if _RECORD.value:
-        append_results(_RECORD.value, "represent", configs.config_hash(config), results)
+        append_results(_RECORD.value, config.method, configs.config_hash(config), results)
 
 
 if __name__ == "__main__":

@@ -40,17 +40,17 @@ def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
     if not run.is_done("regression"):
         raise RepresentError(f"{run_dir}: this run has no rewards yet, its regression is not done")
     env = make_env(config.env, config.backend)
-    sizes = (env.observation_size, env.action_size, config.num_strategies)
+    sizes = (env.observation_size, env.action_size, config.num_groups)
     example = jax.eval_shape(
         lambda key: regression.init(key, *sizes, config.regression), jax.random.PRNGKey(0)
     )
     rewards = run.load_output("regression", example.rewards)
-    targets = target_names(config.num_strategies)
+    targets = target_names(config)
 
     def reward(obs_t, action_t, next_obs_t, target: str = "task") -> jax.Array:
         if target not in targets:
             raise unknown("target", target, targets)
-        strategy = None if target == "task" else targets.index(target) - 1
+        strategy = targets.index(target) - 1 if targets.index(target) else None
         arrays = (jnp.asarray(x) for x in (obs_t, action_t, next_obs_t))
         return regression.reward(rewards, *arrays, config.regression, strategy)
 
@@ -75,7 +75,7 @@ def load_policy(
     """
     config = load_config(run_dir)
     run = RunDirectory(run_dir)
-    targets = target_names(config.num_strategies)
+    targets = target_names(config)
     if target not in targets:
         raise unknown("target", target, targets)
     if not run.is_done("policies"):

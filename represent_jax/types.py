@@ -7,6 +7,7 @@ import jax
 
 Metrics = Mapping[str, jax.Array]
 Params = object
+Carry = object
 
 
 class Transition(NamedTuple):
@@ -43,3 +44,19 @@ class PolicyFn(Protocol):
 
     def __call__(self, params: Params, obs_t: jax.Array, key: jax.Array) -> jax.Array:
         """Returns an action in [-1, 1] for each row, `[..., action_dim]`."""
+
+
+class RecurrentPolicyFn(Protocol):
+    """A policy with a hidden state as a pure function of its parameters."""
+
+    def __call__(
+        self, params: Params, carry: Carry, obs_t: jax.Array, key: jax.Array
+    ) -> tuple[Carry, jax.Array]:
+        """Returns the next hidden states and an action in [-1, 1] for each row.
+
+        Args:
+          params: parameters.
+          carry: hidden state of each row, leaves `[num_rows, ...]`.
+          obs_t: observations, `[num_rows, obs_dim]`.
+          key: PRNG key.
+        """

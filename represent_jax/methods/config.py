@@ -20,22 +20,27 @@ class RepresentConfig:
     """Settings of the whole pipeline.
 
     Attributes:
+      method: name of the method, one of `methods.registry`.
       env: the environment's name.
       preset: name of the preset the settings began as.
       seed: seed of everything after the demonstrations.
       backend: physics engine.
       num_strategies: strategies used of those demonstrated; the first ones.
+      grouping: "separate" keeps strategies apart; "merged" takes all demonstrations for those of
+        one; "strategy_1" and so on takes that strategy alone.
       demonstrations: name or file of the demonstrations; the environment's own if empty.
       horizon: environment steps of an episode; 0 is the environment's own.
       population: how members run together, see `methods.population`.
       airl, noise, curve, regression, policies: settings of the stages.
     """
 
+    method: str = "represent"
     env: str = "half_cheetah"
     preset: str = "quick"
     seed: int = 0
     backend: str = "auto"
     num_strategies: int = 2
+    grouping: str = "separate"
     demonstrations: str = ""
     horizon: int = 0
     population: str = "auto"
@@ -47,6 +52,13 @@ class RepresentConfig:
 
     def __post_init__(self) -> None:
         require(self.num_strategies >= 1, "num_strategies", "at least 1", self.num_strategies)
+        groupings = ("separate", "merged", *strategy_names(self.num_strategies))
+        require(
+            self.grouping in groupings,
+            "grouping",
+            f"one of {', '.join(groupings)}",
+            repr(self.grouping),
+        )
         require(self.seed >= 0, "seed", "at least 0", self.seed)
         require(self.horizon >= 0, "horizon", "at least 0", self.horizon)
         if self.policies.start == "phase1":
@@ -57,6 +69,18 @@ class RepresentConfig:
                 f"{settings.hidden_sizes}, those of Phase 1's policy, which policies start from",
                 policies.agent_of(self.policies)[1].hidden_sizes,
             )
+
+    @property
+    def num_groups(self) -> int:
+        """Strategies that the method is given, after grouping."""
+        return self.num_strategies if self.grouping == "separate" else 1
+
+    @property
+    def group_names(self) -> tuple[str, ...]:
+        """What the groups are called: "strategy_1" and so on, or "merged"."""
+        if self.grouping == "separate":
+            return strategy_names(self.num_strategies)
+        return (self.grouping,)
 
 
 class Problem(NamedTuple):
@@ -90,6 +114,13 @@ def make_problem(
             f"demonstrated, found {config.num_strategies}"
         )
     own = [t for t in demonstrations.trajectories if t.strategy < config.num_strategies]
+    if config.grouping != "separate":
+        names = strategy_names(config.num_strategies)
+        own = [
+            dataclasses.replace(t, strategy=0)
+            for t in own
+            if config.grouping in ("merged", names[t.strategy])
+        ]
     return Problem(
         Episode(env, horizon),
         dataclasses.replace(demonstrations, trajectories=tuple(_truncate(t, horizon) for t in own)),
@@ -105,6 +136,17 @@ def _truncate(t: Trajectory, horizon: int) -> Trajectory:
     )
 
 
-def target_names(num_strategies: int) -> tuple[str, ...]:
-    """Names of the rewards a run learns: "task", "strategy_1", ..."""
-    return ("task", *(f"strategy_{i + 1}" for i in range(num_strategies)))
+def strategy_names(num_strategies: int) -> tuple[str, ...]:
+    """ "strategy_1", "strategy_2", ..."""
+    return tuple(f"strategy_{i + 1}" for i in range(num_strategies))
+
+
+def target_names(config: RepresentConfig) -> tuple[str, ...]:
+    """Names of the rewards a run learns: "task", "strategy_1", ...
+
+    Where nothing is decomposed (alpha = 0) there is one: "task", or the strategy it was learned
+    from alone.
+    """
+    if config.regression.strategy_weight == 0.0:
+        return ("task",) if config.grouping in ("separate", "merged") else (config.grouping,)
+    return ("task", *strategy_names(config.num_groups))

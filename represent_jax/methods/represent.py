@@ -16,7 +16,7 @@ from represent_jax.data.trajectories import Demonstrations, Trajectory, Trajecto
 from represent_jax.envs import Episode
 from represent_jax.errors import RepresentError, unknown
 from represent_jax.methods import results as found
-from represent_jax.methods.config import Problem, RepresentConfig
+from represent_jax.methods.config import Problem, RepresentConfig, target_names
 from represent_jax.methods.population import Population, stack
 from represent_jax.runs import RunDirectory
 from represent_jax.runs.loop import advance
@@ -292,14 +292,15 @@ def run_policies(
     directory: RunDirectory,
     checkpoint_seconds: float,
 ) -> PolicyParams:
-    """Policies on R^0 and every R^i; leaves of the result are `[1 + num_strategies, ...]`."""
+    """Policies on R^0 and every R^i; leaves of the result are `[num_targets, ...]`."""
     env, num_strategies = problem.env, problem.demonstrations.num_strategies
+    num_targets = len(target_names(config))
     learning = (config.policies, config.regression)
     _, settings = policies.agent_of(config.policies)
     key_start, key = jax.random.split(key)
     targets = [
         policies.make_target(rewards, strategy, env, *learning)
-        for strategy in (None, *range(num_strategies))
+        for strategy in (None, *range(num_targets - 1))
     ]
     starts = [jax.tree.map(lambda x, i=i: x[i], first.policy) for i in range(num_strategies)]
 
@@ -313,7 +314,7 @@ def run_policies(
             "policies", jax.tree.map(lambda x: _shape_like(x, len(targets)), example)
         )
     task_start = _best_start(key_start, env, targets[0], starts, config)
-    members = list(zip(targets, [starts[task_start], *starts], strict=True))
+    members = list(zip(targets, [starts[task_start], *starts[: num_targets - 1]], strict=True))
     population = Population(
         members, config.population, lambda state: policies.population_axes(state, config.policies)
     )

@@ -46,10 +46,12 @@ def evaluate(
         "preset": config.preset,
         "seed": config.seed,
         "backend": problem.env.backend,
+        "method": config.method,
         "strategies": num_strategies,
+        "targets": list(target_names(config)),
         "demonstrators": [
             {
-                "strategy": i,
+                "name": config.group_names[i],
                 "return_mean": float(np.mean(r)),
                 "return_std": float(np.std(r)),
                 "num": len(r),
@@ -128,7 +130,7 @@ def _reward_results(
     best_demonstration = max(t.total_reward for t in demonstrations.trajectories)
     true = {name: np.asarray(rollouts.true_returns(batch)) for name, batch in groups.items()}
     results, scatter = {}, {}
-    for target, name in enumerate(target_names(demonstrations.num_strategies)):
+    for target, name in enumerate(target_names(config)):
         strategy = target - 1 if target else None
 
         @jax.jit
@@ -194,7 +196,7 @@ def _policy_results(
 
     log = directory.read_log("policies")
     results, curves = {}, {}
-    for target, name in enumerate(target_names(len(demo_means))):
+    for target, name in enumerate(target_names(config)):
         strategy = target - 1 if target else None
         reward_target = policies.make_target(
             rewards, strategy, problem.env, config.policies, config.regression

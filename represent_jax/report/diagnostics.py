@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from represent_jax.report.tables import demonstrator_levels, targets
+from represent_jax.report.tables import demonstrator_levels, groups, targets
 from represent_jax.report.values import display_name, format_correlation, format_number, pearson
 from represent_jax.stages.curve import CurveStatus, describe
 
@@ -55,8 +55,7 @@ def imitation(results: Mapping[str, Any]) -> Verdict | None:
     """Is the imitation at the demonstrator's level? Good from 90 % on, as the levels are shares."""
     levels = demonstrator_levels(results)
     shares = {}
-    for i, one in enumerate(results.get("airl") or ()):
-        target = f"strategy_{i + 1}"
+    for target, one in zip(groups(results), results.get("airl") or (), strict=False):
         if target in levels and one.get("return") is not None:
             shares[target] = _share(one["return"], levels[target][0])
     shares = {target: share for target, share in shares.items() if math.isfinite(share)}
@@ -79,8 +78,7 @@ def imitation(results: Mapping[str, Any]) -> Verdict | None:
 def noise_curve(results: Mapping[str, Any]) -> Verdict | None:
     """Does the return fall with noise, along a sigmoid?"""
     graded, details = {}, {}
-    for i, curve in enumerate(results.get("curve") or ()):
-        target = f"strategy_{i + 1}"
+    for target, curve in zip(groups(results), results.get("curve") or (), strict=False):
         status = str(curve.get("status", "non_finite")).upper()
         status = CurveStatus[status] if status in CurveStatus.__members__ else None
         r2 = curve.get("r2")

@@ -62,7 +62,7 @@ _STYLE = {
 
 def colour(target: str) -> str:
     """Returns the colour that stands for "task" or "strategy_<i>" in every figure."""
-    if target == "task":
+    if target in ("task", "merged"):
         return TASK
     return STRATEGIES[(int(target.rpartition("_")[2]) - 1) % len(STRATEGIES)]
 

@@ -57,7 +57,7 @@ def write_report(run_path: str | os.PathLike) -> Path:
     results = run.read_results() if (run.path / "results.json").exists() else {}
     if not isinstance(results, dict):
         raise RepresentError(f"{run.path / 'results.json'}: not the results of a run")
-    curves = {f"strategy_{i + 1}": curve for i, curve in enumerate(results.get("curve") or ())}
+    curves = dict(zip(tables.groups(results), results.get("curve") or (), strict=False))
     points = _scatter_points(_arrays(run, "scatter"))
     learning = _learning_curves(_arrays(run, "learning_curves"))
     levels = tables.demonstrator_levels(results)
@@ -133,7 +133,7 @@ def _notices(results: Mapping[str, Any]) -> str:
             f"This run is not finished: no results yet for {', '.join(missing)}. "
             "The page shows what there is."
         )
-    if results.get("strategies") == 1:
+    if results.get("strategies") == 1 and len(tables.targets(results)) > 1:
         notices.append(
             "The demonstrations hold one strategy alone: there is nothing to decompose, and task "
             "and strategy reward may share what was learned in any way."

@@ -26,20 +26,23 @@ class Table:
 
 
 def targets(results: Mapping[str, Any]) -> list[str]:
-    """Returns "task", "strategy_1", ..., as many as the results tell of."""
-    num = results.get("strategies") or len(results.get("demonstrators") or ())
-    return ["task", *(f"strategy_{i + 1}" for i in range(num))]
+    """Returns the names of the learned rewards: "task", "strategy_1", ..."""
+    return list(results.get("targets") or ("task", *groups(results)))
+
+
+def groups(results: Mapping[str, Any]) -> list[str]:
+    """Returns the names of the groups of demonstrations: "strategy_1", ..., or "merged"."""
+    return [one["name"] for one in results.get("demonstrators") or ()]
 
 
 def demonstrator_levels(results: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     """Returns, by target, its demonstrators' mean true return and that of the best demonstrator."""
-    returns = [one["return_mean"] for one in results.get("demonstrators") or ()]
-    if not returns or any(value is None for value in returns):
+    returns = {one["name"]: one["return_mean"] for one in results.get("demonstrators") or ()}
+    if not returns or any(value is None for value in returns.values()):
         return {}
-    levels = {"task": (sum(returns) / len(returns), max(returns))}
-    for i, value in enumerate(returns):
-        levels[f"strategy_{i + 1}"] = (value, max(returns))
-    return levels
+    best = max(returns.values())
+    levels = {"task": (sum(returns.values()) / len(returns), best)}
+    return levels | {name: (value, best) for name, value in returns.items()}
 
 
 def returns_table(results: Mapping[str, Any]) -> Table | None:
@@ -48,12 +51,13 @@ def returns_table(results: Mapping[str, Any]) -> Table | None:
     if not demonstrators:
         return None
     levels = demonstrator_levels(results)
+    names = groups(results)
     imitation = results.get("airl") or ()
     policies = results.get("policies") or {}
     rows = []
     for target in targets(results):
         policy = policies.get(target) or {}
-        index = -1 if target == "task" else int(target.rpartition("_")[2]) - 1
+        index = names.index(target) if target in names else -1
         shown, imitated = format_number(levels.get(target, (None,))[0]), "-"
         if 0 <= index < len(demonstrators) and demonstrators[index].get("return_std") is not None:
             shown += f" +- {format_number(demonstrators[index]['return_std'])}"

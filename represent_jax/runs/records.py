@@ -183,12 +183,9 @@ def append_results(
         "seconds": sum(results["seconds"].values()),
         **provenance(),
     }
-    figures = [
-        (f"strategy_{d['strategy'] + 1}", "demo_return", d["return_mean"])
-        for d in results["demonstrators"]
-    ]
-    for i, strategy in enumerate(results.get("airl", ())):
-        figures.append((f"strategy_{i + 1}", "airl_return", strategy["return"]))
+    figures = [(one["name"], "demo_return", one["return_mean"]) for one in results["demonstrators"]]
+    for one, imitation in zip(results["demonstrators"], results.get("airl", ()), strict=False):
+        figures.append((one["name"], "airl_return", imitation["return"]))
     for part in ("rewards", "policies"):
         for target, quantities in results[part].items():
             figures += [(target, name, value) for name, value in quantities.items()]

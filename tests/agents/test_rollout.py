@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from brax.envs import base
 
-from represent_jax.agents.rollout import learned_returns, rollout, true_returns
+from represent_jax.agents.rollout import (
+    learned_returns,
+    rollout,
+    rollout_recurrent,
+    true_returns,
+)
 from represent_jax.envs.episode import Episode
 
 KEY = jax.random.PRNGKey(0)
@@ -96,6 +101,46 @@ def test_each_episode_has_its_noise_level():
     assert np.all(np.abs(batch.actions) <= 1.0)
 
 
+def counting_policy(params, carry, obs_t, key):
+    """Acts by the number of its steps, whatever it sees."""
+    return {"steps": carry["steps"] + 1}, params * carry["steps"][:, None]
+
+
+@pytest.mark.parametrize("end", [100, 2])
+def test_a_hidden_state_of_each_episode_is_carried_from_step_to_step(end):
+    env = Episode(Counter(end), auto_reset=False)
+    start = {"steps": jnp.array([0, 3])}
+    go = jax.jit(
+        lambda carry: rollout_recurrent(env, counting_policy, 0.1, carry, KEY, jnp.zeros(2))
+    )
+    batch = go(start)
+    running = np.arange(HORIZON) < end
+    expected = np.array([[0.0, 0.1, 0.2, 0.3], [0.3, 0.4, 0.5, 0.6]]) * running
+    np.testing.assert_allclose(batch.actions[..., 0], expected, rtol=1e-6)
+    np.testing.assert_array_equal(batch.mask, [running] * 2)
+    np.testing.assert_array_equal(true_returns(batch), [np.sum(np.arange(HORIZON) * running)] * 2)
+
+
+def test_a_hidden_state_sees_observations_and_its_own_keys():
+    def summing_policy(params, carry, obs_t, key):
+        carry = carry + obs_t[:, 0]
+        return carry, jnp.stack([0.01 * carry], axis=-1) + jax.random.uniform(key) * params
+
+    env = Episode(Counter(100), auto_reset=False)
+
+    def actions(params):
+        batch = rollout_recurrent(env, summing_policy, params, jnp.zeros(1), KEY, jnp.zeros(1))
+        return batch.actions[0, :, 0]
+
+    # Sums of 0; 0, 1; 0, 1, 2; 0, 1, 2, 3.
+    np.testing.assert_allclose(actions(0.0), [0.0, 0.01, 0.03, 0.06], rtol=1e-6)
+    drawn = np.asarray(actions(0.5) - actions(0.0))
+    assert len(np.unique(drawn)) == HORIZON
+
+
 def test_environments_that_reset_themselves_are_refused():
+    env = Episode(Counter(2))
     with pytest.raises(ValueError, match="auto_reset"):
-        rollout(Episode(Counter(2)), policy, 0.25, KEY, jnp.zeros(2))
+        rollout(env, policy, 0.25, KEY, jnp.zeros(2))
+    with pytest.raises(ValueError, match="auto_reset"):
+        rollout_recurrent(env, counting_policy, 0.1, {"steps": jnp.zeros(2)}, KEY, jnp.zeros(2))

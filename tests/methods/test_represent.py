@@ -129,6 +129,23 @@ def test_pipeline_with_ppo_throughout(tmp_path):
     assert rj.load_policy(out)(np.zeros((2, 17), np.float32)).shape == (2, 6)
 
 
+def test_ssrr_on_merged_demonstrations_and_on_one_strategy(tmp_path):
+    record = tmp_path / "records.jsonl"
+    flags = ("--method=ssrr", "--backend=mujoco", f"--record={record}")
+    _finish(_launch(tmp_path / "merged", *flags))
+    _finish(_launch(tmp_path / "alone", *flags, "--override=grouping=strategy_2"))
+    merged, alone = _results(tmp_path / "merged"), _results(tmp_path / "alone")
+    assert set(merged["policies"]) == {"task"} and set(alone["policies"]) == {"strategy_2"}
+    assert merged["demonstrators"][0]["num"] == 2 * alone["demonstrators"][0]["num"]
+    lines = [json.loads(line) for line in record.read_text().splitlines()]
+    assert {line["method"] for line in lines} == {"ssrr"}
+    assert {"merged", "task", "strategy_2"} == {line["target"] for line in lines}
+    reward = rj.load_reward(tmp_path / "alone")
+    assert reward(np.zeros((3, 17)), np.zeros((3, 6)), np.zeros((3, 17)), "strategy_2").shape == (
+        3,
+    )
+
+
 def test_evaluate_judges_a_finished_run(finished):
     out, _, _ = finished
     command = [sys.executable, "-m", "experiments.evaluate", f"--run={out}", "--backend=mujoco"]
@@ -170,6 +187,8 @@ def test_reward_of_an_unfinished_run_is_an_error(tmp_path):
         ("--env=halfcheetah", "half_cheetah"),
         ("--preset=smok", "smoke"),
         ("--until=nois", "noise"),
+        ("--method=srr", "ssrr"),
+        ("--override=grouping=strategy_3", "strategy_2"),
         ("--backend=mjxx", "mjx"),
         ("--override=airl.env_step=10", "airl.env_steps"),
         ("--override=num_strategies=9", "num_strategies"),

@@ -28,11 +28,12 @@ def results():
     return {
         **{"env": "half_cheetah", "preset": "quick", "seed": 0, "backend": "mujoco"},
         "strategies": 2,
+        "targets": list(TARGETS),
         "seconds": {"airl": 183.2, "noise": 4.1},
         "peak_memory_gib": 2.31,
         "demonstrators": [
-            {"strategy": 0, "return_mean": 1200.0, "return_std": 12.0, "num": 4},
-            {"strategy": 1, "return_mean": 1600.0, "return_std": 25.5, "num": 4},
+            {"name": "strategy_1", "return_mean": 1200.0, "return_std": 12.0, "num": 4},
+            {"name": "strategy_2", "return_mean": 1600.0, "return_std": 25.5, "num": 4},
         ],
         "airl": [{"return": 1150.0, "ratio": 0.958}, {"return": 1590.0, "ratio": 0.994}],
         "curve": [curve, curve],

@@ -1,0 +1,145 @@
+"""A graph of stages, each run once and found again by the hash of what it depends on.
+
+A node's folder is named after its hash, so that methods and tables that need the same stage share
+it, a graph that was killed goes on where it was, and a changed setting runs anew only what lies
+behind it.
+"""
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from represent_jax.data.atomic import replacing
+from represent_jax.errors import RepresentError
+from represent_jax.runs.directory import RunDirectory, open_run
+
+DONE, FAILED, BLOCKED = "done", "failed", "blocked"
+_MARK = "done.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Node:
+    """One stage and everything its output depends on.
+
+    Attributes:
+      kind: what it does; nodes of a kind take about equally long.
+      name: what people see.
+      settings: what the output depends on beside the inputs; JSON.
+      inputs: nodes whose outputs `run` is given, in order.
+      run: `run(directory, *outputs)` returns the output; where the directory holds it already, it
+        is loaded and not made again.
+    """
+
+    kind: str
+    name: str
+    settings: Mapping[str, Any]
+    inputs: tuple["Node", ...]
+    run: Callable[..., Any]
+
+    @property
+    def hash(self) -> str:
+        """Hash of kind, settings and inputs; the name plays no part."""
+        told = [self.kind, self.settings, [node.hash for node in self.inputs]]
+        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class Graph:
+    """Nodes and the folder their outputs live in."""
+
+    def __init__(self, nodes: Iterable[Node], folder: Path):
+        """Orders the nodes, with all they need, so that inputs come first."""
+        self.folder = Path(folder)
+        self.nodes: list[Node] = []
+        self.states: dict[str, str] = {}
+        self.errors: dict[str, str] = {}
+        self._outputs: dict[str, Any] = {}
+        seen: set[str] = set()
+        for node in nodes:
+            self._add(node, seen)
+        for node in self.nodes:
+            if self._mark(node).is_file():
+                self.states[node.hash] = DONE
+
+    def _add(self, node: Node, seen: set[str]) -> None:
+        if node.hash in seen:
+            return
+        seen.add(node.hash)
+        for before in node.inputs:
+            self._add(before, seen)
+        self.nodes.append(node)
+
+    @property
+    def left(self) -> list[Node]:
+        """Nodes still to run, in order."""
+        return [node for node in self.nodes if node.hash not in self.states]
+
+    def seconds_left(self) -> float | None:
+        """What the nodes left will take, from those of their kind; None where none has run."""
+        taken: dict[str, list[float]] = {}
+        for node in self.nodes:
+            if self.states.get(node.hash) == DONE:
+                taken.setdefault(node.kind, []).append(self.seconds(node))
+        if any(node.kind not in taken for node in self.left):
+            return None
+        return sum(sum(taken[node.kind]) / len(taken[node.kind]) for node in self.left)
+
+    def seconds(self, node: Node) -> float:
+        """What a node that is done took, restarts counted in."""
+        return json.loads(self._mark(node).read_text())["seconds"]
+
+    def run(self, report: Callable[["Graph", Node, str], None]) -> None:
+        """Runs what is left; a node that fails blocks those behind it and stops no other.
+
+        Args:
+          report: called with the node and "running", and again with how it ended.
+        """
+        for node in self.left:
+            if any(self.states.get(before.hash) != DONE for before in node.inputs):
+                self._end(node, BLOCKED, report)
+                continue
+            report(self, node, "running")
+            start = time.monotonic()
+            try:
+                self._outputs[node.hash] = node.run(self.directory(node), *self._inputs(node))
+            except (RepresentError, ArithmeticError, ValueError, RuntimeError) as error:
+                self.errors[node.hash] = f"{type(error).__name__}: {error}"
+                self._end(node, FAILED, report)
+                continue
+            seconds = round(time.monotonic() - start, 1)
+            with replacing(self._mark(node)) as temporary:
+                temporary.write_text(json.dumps({"name": node.name, "seconds": seconds}) + "\n")
+            self._end(node, DONE, report)
+            self._forget()
+
+    def output(self, node: Node) -> Any:
+        """Returns the output of a node that is done, from memory or from its folder."""
+        if node.hash not in self._outputs:
+            if self.states.get(node.hash) != DONE:
+                raise RepresentError(f"{node.name}: has no output, it is not done")
+            self._outputs[node.hash] = node.run(self.directory(node), *self._inputs(node))
+        return self._outputs[node.hash]
+
+    def directory(self, node: Node) -> RunDirectory:
+        """Returns the folder of a node, made where there is none."""
+        config = {"kind": node.kind, "settings": dict(node.settings)}
+        config["inputs"] = [before.hash for before in node.inputs]
+        return open_run(self.folder / node.hash, config, resume=True)
+
+    def _inputs(self, node: Node) -> Sequence[Any]:
+        return [self.output(before) for before in node.inputs]
+
+    def _mark(self, node: Node) -> Path:
+        return self.folder / node.hash / _MARK
+
+    def _end(self, node: Node, state: str, report: Callable) -> None:
+        self.states[node.hash] = state
+        report(self, node, state)
+
+    def _forget(self) -> None:
+        """Drops outputs that no node left needs at once."""
+        needed = {before.hash for node in self.left for before in node.inputs}
+        self._outputs = {key: value for key, value in self._outputs.items() if key in needed}
