@@ -13,6 +13,7 @@ from represent_jax.agents import rollout as rollouts
 from represent_jax.agents.sac import PolicyParams
 from represent_jax.data.trajectories import pad
 from represent_jax.envs import Episode
+from represent_jax.methods import pipeline
 from represent_jax.methods.config import Problem, RepresentConfig, target_names
 from represent_jax.runs import RunDirectory, provenance
 from represent_jax.stages import airl, curve, evaluation, noise, policies, regression, style
@@ -180,29 +181,27 @@ def _policy_results(
     directory: RunDirectory,
 ) -> dict[str, Any]:
     @jax.jit
-    def final(key, policy, reward_target):
+    def final(key, policy, objective):
         batch, result = policies.rollout(
             key,
             problem.env,
-            reward_target,
+            objective,
             policy,
             FINAL_EPISODES,
             config.policies,
-            config.regression,
+            pipeline.reward_fn_of(config),
         )
         posterior = jnp.exp(style.log_posterior(classifier, batch.obs[:, 1:]))
         share = jnp.sum(posterior * batch.mask[..., None], axis=(0, 1)) / jnp.sum(batch.mask)
         return result, share
 
     log = directory.read_log("policies")
+    objectives = pipeline.objectives_of(config, problem.env, rewards)
     results, curves = {}, {}
     for target, name in enumerate(target_names(config)):
         strategy = target - 1 if target else None
-        reward_target = policies.make_target(
-            rewards, strategy, problem.env, config.policies, config.regression
-        )
         policy = jax.tree.map(lambda x, target=target: x[target], trained)
-        (true, learned), share = final(jax.random.fold_in(key, target), policy, reward_target)
+        (true, learned), share = final(jax.random.fold_in(key, target), policy, objectives[target])
         path = {
             "env_steps": [line["step"] for line in log],
             "true_return": [line["true_return"][target] for line in log],

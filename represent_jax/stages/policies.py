@@ -1,9 +1,9 @@
-"""Policies on learned rewards: SAC, or PPO, on R^0 and on every R^i.
+"""Policies on learned rewards: SAC, or PPO, on R^0 and on every R^i, or on a baseline's reward.
 
-The learned reward is used in the unit rho = R * horizon / S, less `center`: a noise-free episode
-of Phase 1 then earns about nothing, and an agent that starts from Phase 1's policy is paid only
-for getting better. Starting from that policy is what makes improvement reliable: from random
-networks, SAC finds local optima of the same reward below what running well would pay.
+A learned reward R is used as rho = scale * R - center, where a noise-free episode of Phase 1
+earns about 1 a step before the center is subtracted: an agent that starts from Phase 1's policy is
+then paid only for getting better. Starting from that policy is what makes improvement reliable:
+from random networks, SAC finds local optima of the same reward below what running well would pay.
 """
 
 import dataclasses
@@ -21,9 +21,7 @@ from represent_jax.agents.sac import PolicyParams, SacConfig
 from represent_jax.config import require
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.envs.episode import Episode
-from represent_jax.stages import regression
-from represent_jax.stages.regression import RegressionConfig
-from represent_jax.types import Metrics
+from represent_jax.types import Metrics, Params, RewardFn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,20 +69,15 @@ def agent_of(config: PoliciesConfig) -> tuple[ModuleType, SacConfig | PpoConfig]
     return find_agent(config.agent), getattr(config, config.agent)
 
 
-class Target(NamedTuple):
-    """A reward to maximise, of the same shape for R^0 and every R^i.
+class Objective(NamedTuple):
+    """What an agent maximises: scale * R - center, of the same shape for all targets.
 
     Attributes:
-      heads: the task's and one strategy's parameters.
-      strategy_weight: 0 for R^0, alpha_i for R^i, `[]`.
-      scale: horizon / S, which turns R into rho, `[]`.
-      keep: which policy is handed on: of those evaluated the "best" by learned return, or the
-        "last".
-      center: subtracted from rho, `[]`.
+      params: parameters of the learned reward R.
+      scale, center: `[]`.
     """
 
-    heads: regression.Rewards
-    strategy_weight: jax.Array
+    params: Params
     scale: jax.Array
     center: jax.Array
 
@@ -109,76 +102,53 @@ class Evaluation(NamedTuple):
 
     Attributes:
       true_return: return under the environment's reward, `[]` where averaged.
-      learned_return: return under the learned reward, `[]` where averaged.
+      learned_return: return under the learned reward R, `[]` where averaged.
     """
 
     true_return: jax.Array
     learned_return: jax.Array
 
 
-def make_target(
-    rewards: regression.Rewards,
-    strategy: int | None,
-    env: Episode,
-    config: PoliciesConfig,
-    regression_config: RegressionConfig,
-) -> Target:
-    """Picks R^0 (`strategy=None`) or R^i (counted from 0) as the reward to maximise."""
-    heads = regression.Rewards(
-        rewards.task, jax.tree.map(lambda leaf: leaf[:, strategy or 0], rewards.strategies)
-    )
-    weight = 0.0 if strategy is None else regression_config.strategy_weight
-    return Target(
-        heads,
-        jnp.float32(weight),
-        jnp.float32(env.horizon / regression_config.return_scale),
-        jnp.float32(0.0 if env.terminates else config.center),
-    )
+def make_objective(params: Params, scale: float, env: Episode, config: PoliciesConfig) -> Objective:
+    """Centres a reward, unless episodes can end early."""
+    center = 0.0 if env.terminates else config.center
+    return Objective(params, jnp.float32(scale), jnp.float32(center))
 
 
-def reward(
-    target: Target,
-    obs_t: jax.Array,
-    action_t: jax.Array,
-    next_obs_t: jax.Array,
-    config: RegressionConfig,
-) -> jax.Array:
-    """What SAC maximises: rho - center, `[...]`."""
-    learned = learned_reward(target, obs_t, action_t, next_obs_t, config)
-    return target.scale * learned - target.center
+def _maximised(reward_fn: RewardFn) -> RewardFn:
+    def maximised(objective, obs_t, action_t, next_obs_t):
+        learned = reward_fn(objective.params, obs_t, action_t, next_obs_t)
+        return objective.scale * learned - objective.center
 
-
-def learned_reward(
-    target: Target,
-    obs_t: jax.Array,
-    action_t: jax.Array,
-    next_obs_t: jax.Array,
-    config: RegressionConfig,
-) -> jax.Array:
-    """R^0 or R^i in its own unit, `[...]`."""
-    inputs = (obs_t, action_t, next_obs_t, config)
-    task = regression.head_reward(target.heads.task, *inputs)
-    strategy = regression.head_reward(target.heads.strategies, *inputs)
-    return task + target.strategy_weight * strategy
+    return maximised
 
 
 def init(
     key: jax.Array,
     env: Episode,
-    target: Target,
+    objective: Objective,
     policy: PolicyParams,
     config: PoliciesConfig,
-    regression_config: RegressionConfig,
+    reward_fn: RewardFn,
 ) -> PolicyState:
-    """Starts an agent on a target, from `policy` unless the start is cold."""
+    """Starts an agent on an objective, from `policy` unless the start is cold.
+
+    Args:
+      key: PRNG key.
+      env: episodes to learn in.
+      objective: the reward's parameters, scale and center.
+      policy: Phase 1's.
+      config: settings.
+      reward_fn: the learned reward R.
+    """
     agent, settings = agent_of(config)
     state = agent.init(
         key,
         env,
         settings,
         policy_params=policy if config.start == "phase1" else None,
-        reward_fn=lambda *args: reward(*args, regression_config),
-        reward_params=target,
+        reward_fn=_maximised(reward_fn),
+        reward_params=objective,
     )
     # A copy: the state is donated, and two leaves must not share one buffer.
     best = jax.tree.map(jnp.copy, agent.policy_of(state.learner))
@@ -188,9 +158,9 @@ def init(
 def train(
     state: PolicyState,
     env: Episode,
-    target: Target,
+    objective: Objective,
     config: PoliciesConfig,
-    regression_config: RegressionConfig,
+    reward_fn: RewardFn,
 ) -> tuple[PolicyState, Metrics]:
     """Trains for `eval_env_steps`, evaluates, and keeps the better policy by learned return."""
     agent, settings = agent_of(config)
@@ -200,12 +170,12 @@ def train(
         env,
         settings,
         num_steps,
-        reward_fn=lambda *args: reward(*args, regression_config),
-        reward_params=target,
+        reward_fn=_maximised(reward_fn),
+        reward_params=objective,
     )
     key_eval, key = jax.random.split(agent_state.key)
     policy = agent.policy_of(agent_state.learner)
-    result = evaluate(key_eval, env, target, policy, config, regression_config)
+    result = evaluate(key_eval, env, objective, policy, config, reward_fn)
     better = result.learned_return > state.best_learned_return
     state = PolicyState(
         agent=agent_state.replace(key=key),
@@ -231,24 +201,24 @@ def population_axes(state: PolicyState, config: PoliciesConfig) -> PolicyState:
 def evaluate(
     key: jax.Array,
     env: Episode,
-    target: Target,
+    objective: Objective,
     policy: PolicyParams,
     config: PoliciesConfig,
-    regression_config: RegressionConfig,
+    reward_fn: RewardFn,
 ) -> Evaluation:
     """Runs deterministic episodes; the true return is only ever reported, never used."""
-    _, result = rollout(key, env, target, policy, config.eval_episodes, config, regression_config)
+    _, result = rollout(key, env, objective, policy, config.eval_episodes, config, reward_fn)
     return jax.tree.map(jnp.mean, result)
 
 
 def rollout(
     key: jax.Array,
     env: Episode,
-    target: Target,
+    objective: Objective,
     policy: PolicyParams,
     num_episodes: int,
     config: PoliciesConfig,
-    regression_config: RegressionConfig,
+    reward_fn: RewardFn,
 ) -> tuple[TrajectoryBatch, Evaluation]:
     """Runs deterministic episodes; returns them and both returns of each, `[num_episodes]`."""
     whole = Episode(env.env, env.horizon, auto_reset=False)
@@ -258,7 +228,5 @@ def rollout(
         return agent.act(params, obs_t, key, settings, env.action_size, deterministic=True)
 
     batch = rollouts.rollout(whole, act, policy, key, jnp.zeros(num_episodes))
-    learned = rollouts.learned_returns(
-        batch, lambda *args: learned_reward(*args, regression_config), target
-    )
+    learned = rollouts.learned_returns(batch, reward_fn, objective.params)
     return batch, Evaluation(rollouts.true_returns(batch), learned)

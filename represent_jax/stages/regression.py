@@ -404,6 +404,39 @@ def head_reward(
     return jnp.mean(jax.vmap(_head(config).apply, in_axes=(0, None))(head, inputs), axis=0)
 
 
+class View(NamedTuple):
+    """One reward of all, of the same shape for R^0 and every R^i.
+
+    Attributes:
+      task, own: parameters of R^0 and of one R~^i, leaves `[ensemble, ...]`.
+      strategy_weight: 0 for R^0, alpha_i for R^i, `[]`.
+    """
+
+    task: Params
+    own: Params
+    strategy_weight: jax.Array
+
+
+def view(rewards: Rewards, strategy: int | None, config: RegressionConfig) -> View:
+    """Picks R^0 (`strategy=None`) or R^i (counted from 0)."""
+    own = jax.tree.map(lambda leaf: leaf[:, strategy or 0], rewards.strategies)
+    weight = 0.0 if strategy is None else config.strategy_weight
+    return View(rewards.task, own, jnp.float32(weight))
+
+
+def view_reward(
+    view: View,
+    obs_t: jax.Array,
+    action_t: jax.Array,
+    next_obs_t: jax.Array,
+    config: RegressionConfig,
+) -> jax.Array:
+    """R^0 or R^i, `[...]`."""
+    inputs = (obs_t, action_t, next_obs_t, config)
+    own = head_reward(view.own, *inputs)
+    return head_reward(view.task, *inputs) + view.strategy_weight * own
+
+
 def reward(
     rewards: Rewards,
     obs_t: jax.Array,
@@ -413,9 +446,5 @@ def reward(
     strategy: int | None = None,
 ) -> jax.Array:
     """R^0, or R^i = R^0 + alpha_i R~^i (Eq. 1) of one strategy counted from 0, `[...]`."""
-    task = head_reward(rewards.task, obs_t, action_t, next_obs_t, config)
-    if strategy is None:
-        return task
-    head = jax.tree.map(lambda leaf: leaf[:, strategy], rewards.strategies)
-    own = head_reward(head, obs_t, action_t, next_obs_t, config)
-    return task + config.strategy_weight * own
+    one = view(rewards, strategy, config)
+    return view_reward(one, obs_t, action_t, next_obs_t, config)

@@ -13,9 +13,9 @@ from represent_jax.data.catalogue import load_demonstrations
 from represent_jax.envs import make_env
 from represent_jax.errors import UsageError
 from represent_jax.methods.config import make_problem
+from represent_jax.methods.pipeline import transitions_of
 from represent_jax.methods.population import stack
 from represent_jax.methods.presets import make_config
-from represent_jax.methods.represent import transitions_of
 from represent_jax.stages import msrd
 from represent_jax.stages.discriminator import Rows
 from represent_jax.stages.evaluation import pearson

@@ -1,0 +1,309 @@
+"""The stages on a run directory: population, progress, checkpoints, and loading what is done.
+
+A stage itself (`represent_jax.stages`) knows of none of these. Methods call the functions here in
+the order that makes the method.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from represent_jax.agents.sac import PolicyParams
+from represent_jax.data.trajectories import Demonstrations, Trajectory, TrajectoryBatch, pad
+from represent_jax.envs import Episode
+from represent_jax.errors import RepresentError
+from represent_jax.methods.config import Problem, RepresentConfig, target_names
+from represent_jax.methods.population import Population, stack
+from represent_jax.runs import RunDirectory
+from represent_jax.runs.loop import advance
+from represent_jax.stages import airl, curve, noise, policies, regression
+from represent_jax.types import RewardFn, Transition
+
+# --- Phase 1 ---
+
+
+def run_airl(
+    key: jax.Array,
+    config: RepresentConfig,
+    problem: Problem,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> airl.AirlOutput:
+    """Phase 1 for all strategies; leaves of the result are `[num_strategies, ...]`."""
+    members = transitions_of(problem.demonstrations)
+    population = Population(members, config.population, airl.population_axes)
+
+    def init(key, demonstrations):
+        return airl.init(key, problem.env, demonstrations, config.airl)
+
+    if directory.is_done("airl"):
+        example = airl.finish(jax.eval_shape(init, key, members[0]))
+        example = jax.tree.map(lambda x: _shape_like(x, len(members)), example)
+        return directory.load_output("airl", example)
+    per_step = airl.generator(config.airl)[1].env_steps_per_step
+    chunk_env_steps = _chunk(config.airl.env_steps, per_step)
+    step = population.stepper(
+        lambda state, demonstrations: airl.train(
+            state, problem.env, demonstrations, config.airl, chunk_env_steps // per_step
+        )
+    )
+    states = advance(
+        directory,
+        "airl",
+        population.init(init, key),
+        step,
+        -(-config.airl.env_steps // chunk_env_steps),
+        units_per_chunk=chunk_env_steps,
+        checkpoint_seconds=checkpoint_seconds,
+        describe=lambda m: "discriminator " + _numbers(m["discriminator_loss"]),
+    )
+    output = stack([airl.finish(state) for state in population.members(states)])
+    directory.save_output("airl", output)
+    return output
+
+
+def transitions_of(demonstrations: Demonstrations) -> list[Transition]:
+    """Transitions of each strategy, repeated to one common number, `[num_transitions]`."""
+    gathered = [
+        _transitions(demonstrations.of_strategy(i)) for i in range(demonstrations.num_strategies)
+    ]
+    longest = max(len(rows.reward_t) for rows in gathered)
+    return [
+        jax.tree.map(lambda x: jnp.asarray(np.resize(x, (longest, *x.shape[1:]))), rows)
+        for rows in gathered
+    ]
+
+
+def _transitions(trajectories: tuple[Trajectory, ...]) -> Transition:
+    discount = [np.ones(t.length, np.float32) for t in trajectories]
+    for rows, t in zip(discount, trajectories, strict=True):
+        rows[-1] = 0.0 if t.terminated else 1.0
+    discount_t = np.concatenate(discount)
+    nothing = np.zeros_like(discount_t)
+    return Transition(
+        obs_t=np.concatenate([t.obs[:-1] for t in trajectories]),
+        action_t=np.concatenate([t.actions for t in trajectories]),
+        next_obs_t=np.concatenate([t.obs[1:] for t in trajectories]),
+        # The true reward stays out: nothing before the evaluation may see it.
+        reward_t=nothing,
+        discount_t=discount_t,
+        noise_level_t=nothing,
+    )
+
+
+# --- Phase 2 ---
+
+
+def run_noise(
+    key: jax.Array,
+    config: RepresentConfig,
+    problem: Problem,
+    first: airl.AirlOutput,
+    directory: RunDirectory,
+) -> noise.NoisyData:
+    """Phase 2's rollouts; leaves of the result are `[num_strategies, ...]`."""
+    env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
+
+    def policy(params, obs_t, key):
+        return airl.act(params, obs_t, key, config.airl, env.action_size)
+
+    def reward(params, obs_t, action_t, next_obs_t):
+        return airl.reward(params, obs_t, action_t, next_obs_t, config.airl)
+
+    def one(key, first):
+        return noise.run(key, env, policy, first.policy, reward, first.reward, config.noise)
+
+    keys = jax.random.split(key, problem.demonstrations.num_strategies)
+    if directory.is_done("noise"):
+        return directory.load_output("noise", jax.eval_shape(jax.vmap(one), keys, first))
+    output = jax.block_until_ready(jax.jit(jax.vmap(one))(keys, first))
+    directory.save_output("noise", output)
+    return output
+
+
+def fit_curves(config: RepresentConfig, noisy: noise.NoisyData) -> curve.Curve:
+    """The noise-performance curve of every strategy; leaves are `[num_strategies, ...]`.
+
+    Raises:
+      RepresentError: Phase 1's reward is not finite.
+    """
+    fit = jax.vmap(lambda levels, returns: curve.fit(levels, returns, config.curve))
+    curves = jax.jit(fit)(noisy.levels, noisy.returns)
+    _check_curves(curves)
+    return curves
+
+
+def _check_curves(curves: curve.Curve) -> None:
+    for i, status in enumerate(np.asarray(curves.status)):
+        if status == curve.CurveStatus.NON_FINITE:
+            raise RepresentError(f"curve of strategy {i + 1}: {curve.describe(status)}")
+
+
+# --- Phase 3 ---
+
+
+def run_regression(
+    key: jax.Array,
+    config: RepresentConfig,
+    problem: Problem,
+    noisy: noise.NoisyData,
+    curves: curve.Curve,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> regression.Rewards:
+    """Phase 3: all rewards at once."""
+    num_strategies = problem.demonstrations.num_strategies
+    sizes = (problem.env.observation_size, problem.env.action_size, num_strategies)
+
+    def init(key):
+        return regression.init(key, *sizes, config.regression)
+
+    if directory.is_done("regression"):
+        return directory.load_output("regression", jax.eval_shape(init, key).rewards)
+    targets = jnp.repeat(curves.fitted, config.noise.trajectories_per_level, axis=1)
+    data = regression.RegressionData(noisy.trajectories, targets, _padded_demonstrations(problem))
+    updates_per_chunk = max(1, config.regression.num_updates // 20)
+    compiled = jax.jit(
+        lambda state, data: regression.train(state, data, config.regression, updates_per_chunk),
+        donate_argnums=0,
+    )
+    state = advance(
+        directory,
+        "regression",
+        jax.jit(init)(key),
+        lambda state: compiled(state, data),
+        -(-config.regression.num_updates // updates_per_chunk),
+        units_per_chunk=updates_per_chunk,
+        unit="updates",
+        checkpoint_seconds=checkpoint_seconds,
+        describe=lambda m: "loss " + _numbers(m["ssrr_loss"]),
+    )
+    directory.save_output("regression", state.rewards)
+    return state.rewards
+
+
+def _padded_demonstrations(problem: Problem) -> TrajectoryBatch:
+    """Demonstrations `[num_strategies, num_demonstrations]`, repeated to one common number."""
+    demonstrations = problem.demonstrations
+    groups = [demonstrations.of_strategy(i) for i in range(demonstrations.num_strategies)]
+    most = max(len(group) for group in groups)
+    padded = [
+        pad([group[j % len(group)] for j in range(most)], problem.env.horizon) for group in groups
+    ]
+    return stack(padded)
+
+
+# --- Policies ---
+
+
+def objectives_of(
+    config: RepresentConfig, env: Episode, rewards: regression.Rewards
+) -> list[policies.Objective]:
+    """The objectives of a run's targets, in their order: R^0, and every R^i that there is."""
+    scale = env.horizon / config.regression.return_scale
+    return [
+        policies.make_objective(
+            regression.view(rewards, strategy, config.regression), scale, env, config.policies
+        )
+        for strategy in (None, *range(len(target_names(config)) - 1))
+    ]
+
+
+def reward_fn_of(config: RepresentConfig) -> RewardFn:
+    """R^0 or R^i as a function of its `regression.View`."""
+
+    def reward_fn(view, obs_t, action_t, next_obs_t):
+        return regression.view_reward(view, obs_t, action_t, next_obs_t, config.regression)
+
+    return reward_fn
+
+
+def run_policies(
+    key: jax.Array,
+    config: RepresentConfig,
+    env: Episode,
+    objectives: Sequence[policies.Objective],
+    reward_fn: RewardFn,
+    starts: Sequence[PolicyParams],
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> PolicyParams:
+    """Policies on learned rewards; leaves of the result are `[num_objectives, ...]`.
+
+    Args:
+      key: PRNG key.
+      config: settings.
+      env: episodes to learn in.
+      objectives: what to maximise. The first is the task's: it starts from the policy of highest
+        learned task return; the others start from `starts` in order.
+      reward_fn: the reward whose parameters the objectives hold.
+      starts: Phase 1's policies.
+      directory: where the stage is saved, and restored from.
+      checkpoint_seconds: least time between two checkpoints.
+    """
+    settings = config.policies
+    key_start, key = jax.random.split(key)
+
+    def init(key, member):
+        return policies.init(key, env, *member, settings, reward_fn)
+
+    if directory.is_done("policies"):
+        state = jax.eval_shape(init, key, (objectives[0], starts[0]))
+        example = policies.finish(state, settings)
+        return directory.load_output(
+            "policies", jax.tree.map(lambda x: _shape_like(x, len(objectives)), example)
+        )
+    best = _best_start(key_start, env, objectives[0], starts, settings, reward_fn)
+    members = list(zip(objectives, [best, *starts[: len(objectives) - 1]], strict=True))
+    population = Population(
+        members, config.population, lambda state: policies.population_axes(state, settings)
+    )
+    step = population.stepper(
+        lambda state, member: policies.train(state, env, member[0], settings, reward_fn)
+    )
+    per_step = policies.agent_of(settings)[1].env_steps_per_step
+    chunk_env_steps = max(1, settings.eval_env_steps // per_step) * per_step
+    states = advance(
+        directory,
+        "policies",
+        population.init(init, key),
+        step,
+        -(-settings.env_steps // chunk_env_steps),
+        units_per_chunk=chunk_env_steps,
+        checkpoint_seconds=checkpoint_seconds,
+        describe=lambda m: "learned return " + _numbers(m["learned_return"]),
+    )
+    output = stack([policies.finish(state, settings) for state in population.members(states)])
+    directory.save_output("policies", output)
+    return output
+
+
+def _best_start(
+    key: jax.Array,
+    env: Episode,
+    task: policies.Objective,
+    starts: Sequence[PolicyParams],
+    config: policies.PoliciesConfig,
+    reward_fn: RewardFn,
+) -> PolicyParams:
+    """The Phase 1 policy with the highest learned task return."""
+    score = jax.jit(
+        lambda policy: policies.evaluate(key, env, task, policy, config, reward_fn).learned_return
+    )
+    return starts[int(np.argmax([float(score(policy)) for policy in starts]))]
+
+
+def _chunk(env_steps: int, per_step: int) -> int:
+    """Environment steps between two host round trips: a twentieth of the budget."""
+    return max(1, env_steps // 20 // per_step) * per_step
+
+
+def _shape_like(leaf: Any, num_members: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((num_members, *leaf.shape), leaf.dtype)
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{float(value):.3g}" for value in np.atleast_1d(values))
