@@ -15,7 +15,6 @@ from represent_jax.api import load_config, load_policy, load_reward
 from represent_jax.data.catalogue import load_demonstrations
 from represent_jax.data.trajectories import pad
 from represent_jax.envs import Episode, make_env
-from represent_jax.methods.config import target_names
 from represent_jax.report import tables
 from represent_jax.report.values import display_name, format_number
 from represent_jax.runs import RunDirectory
@@ -46,7 +45,7 @@ def main(argv: list[str]) -> None:
     data = load_demonstrations(_TRAJECTORIES.value or f"{config.env}_test")
     data.check_against(env.observation_size, env.action_size, -1.0, 1.0)
     batch = pad(data.trajectories, max(t.length for t in data.trajectories))
-    targets = target_names(config)
+    targets = config.target_names
     has_policies = RunDirectory(_RUN.value).is_done("policies")
     rows = []
     for target in targets:

@@ -1,4 +1,4 @@
-"""Runs REPRESENT, or SSRR: from demonstrations to rewards, policies and a report.
+"""Runs REPRESENT or a baseline: from demonstrations to rewards, policies and a report.
 
 python -m experiments.represent --env=half_cheetah --preset=quick --out=runs/demo
 python -m experiments.represent --env=hopper --seed=1 --override policies.env_steps=200000
@@ -14,10 +14,9 @@ from experiments import launch
 from represent_jax import config as configs
 from represent_jax.data.catalogue import load_demonstrations
 from represent_jax.envs import make_env
-from represent_jax.methods import represent
-from represent_jax.methods.config import RepresentConfig, make_problem
+from represent_jax.methods.config import MethodConfig, make_problem
 from represent_jax.methods.presets import make_config
-from represent_jax.methods.registry import METHODS, configure
+from represent_jax.methods.registry import METHODS, find_method
 from represent_jax.report import html, tables
 from represent_jax.runs import open_run
 from represent_jax.runs.records import append_results
@@ -36,9 +35,7 @@ _OUT = flags.DEFINE_string(
 )
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting as dotted.key=value; repeatable.")
 _RESUME = flags.DEFINE_bool("resume", False, "Go on with the run in the folder.")
-_UNTIL = flags.DEFINE_string(
-    "until", represent.STAGES[-1], f"Last stage to run: {', '.join(represent.STAGES)}."
-)
+_UNTIL = flags.DEFINE_string("until", "evaluation", "Last of the method's stages to run.")
 _CHECKPOINT_SECONDS = flags.DEFINE_float(
     "checkpoint_seconds", 60.0, "Least time between two checkpoints of a stage."
 )
@@ -49,19 +46,19 @@ def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     for seed in range(_SEED.value, _SEED.value + _NUM_SEEDS.value):
         config = dataclasses.replace(
-            make_config(_PRESET.value, _ENV.value),
+            make_config(_PRESET.value, _ENV.value, _METHOD.value),
             seed=seed,
             backend=_BACKEND.value,
             demonstrations=_DEMONSTRATIONS.value,
         )
-        config = configs.apply_overrides(configure(_METHOD.value, config), _OVERRIDE.value)
+        config = configs.apply_overrides(config, _OVERRIDE.value)
         out = _OUT.value or f"runs/{config.env}-{config.method}-{config.preset}-{seed}"
         if _OUT.value and _NUM_SEEDS.value > 1:
             out = f"{_OUT.value}/seed_{seed}"
         _run(config, out)
 
 
-def _run(config: RepresentConfig, out: str) -> None:
+def _run(config: MethodConfig, out: str) -> None:
     env = make_env(config.env, config.backend)
     problem = make_problem(
         config,
@@ -73,7 +70,8 @@ def _run(config: RepresentConfig, out: str) -> None:
     if problem.demonstrations.num_strategies == 1 and config.method == "represent":
         print("one strategy alone: the rewards are learned, but nothing is decomposed")
     with open_run(out, config, resume=_RESUME.value) as run:
-        results = represent.run(config, problem, run, _CHECKPOINT_SECONDS.value, _UNTIL.value)
+        method = find_method(config.method)
+        results = method.run(config, problem, run, _CHECKPOINT_SECONDS.value, _UNTIL.value)
         if results is None:
             print(f"{out}: done until {_UNTIL.value}; --resume goes on")
             return

@@ -9,18 +9,20 @@ import jax.numpy as jnp
 from represent_jax import config as configs
 from represent_jax.envs import make_env
 from represent_jax.errors import RepresentError, unknown
-from represent_jax.methods.config import RepresentConfig, target_names
+from represent_jax.methods.config import MethodConfig
+from represent_jax.methods.registry import find_method
 from represent_jax.runs import RunDirectory, load_config_json
 from represent_jax.stages import policies, regression
 
 
-def load_config(run_dir: str | os.PathLike) -> RepresentConfig:
+def load_config(run_dir: str | os.PathLike) -> MethodConfig:
     """Loads the settings a run was made with.
 
     Raises:
       RepresentError: not a run directory, or one of an older format.
     """
-    return configs.from_dict(RepresentConfig, load_config_json(run_dir))
+    stored = load_config_json(run_dir)
+    return configs.from_dict(find_method(stored.get("method", "represent")).config, stored)
 
 
 def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
@@ -45,7 +47,7 @@ def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
         lambda key: regression.init(key, *sizes, config.regression), jax.random.PRNGKey(0)
     )
     rewards = run.load_output("regression", example.rewards)
-    targets = target_names(config)
+    targets = config.target_names
 
     def reward(obs_t, action_t, next_obs_t, target: str = "task") -> jax.Array:
         if target not in targets:
@@ -75,7 +77,7 @@ def load_policy(
     """
     config = load_config(run_dir)
     run = RunDirectory(run_dir)
-    targets = target_names(config)
+    targets = config.target_names
     if target not in targets:
         raise unknown("target", target, targets)
     if not run.is_done("policies"):

@@ -1,4 +1,4 @@
-"""Settings of the pipeline, and the problem it is given."""
+"""Settings of a method, and the problem it is given."""
 
 import dataclasses
 from typing import NamedTuple
@@ -16,8 +16,8 @@ from represent_jax.stages.regression import RegressionConfig
 
 
 @dataclasses.dataclass(frozen=True)
-class RepresentConfig:
-    """Settings of the whole pipeline.
+class MethodConfig:
+    """What the settings of every method begin with.
 
     Attributes:
       method: name of the method, one of `methods.registry`.
@@ -31,7 +31,6 @@ class RepresentConfig:
       demonstrations: name or file of the demonstrations; the environment's own if empty.
       horizon: environment steps of an episode; 0 is the environment's own.
       population: how members run together, see `methods.population`.
-      airl, noise, curve, regression, policies: settings of the stages.
     """
 
     method: str = "represent"
@@ -44,11 +43,6 @@ class RepresentConfig:
     demonstrations: str = ""
     horizon: int = 0
     population: str = "auto"
-    airl: AirlConfig = AirlConfig()
-    noise: NoiseConfig = NoiseConfig()
-    curve: CurveConfig = CurveConfig()
-    regression: RegressionConfig = RegressionConfig()
-    policies: PoliciesConfig = PoliciesConfig()
 
     def __post_init__(self) -> None:
         require(self.num_strategies >= 1, "num_strategies", "at least 1", self.num_strategies)
@@ -61,14 +55,6 @@ class RepresentConfig:
         )
         require(self.seed >= 0, "seed", "at least 0", self.seed)
         require(self.horizon >= 0, "horizon", "at least 0", self.horizon)
-        if self.policies.start == "phase1":
-            _, settings = airl.generator(self.airl)
-            require(
-                policies.agent_of(self.policies)[1].hidden_sizes == settings.hidden_sizes,
-                f"policies.{self.policies.agent}.hidden_sizes",
-                f"{settings.hidden_sizes}, those of Phase 1's policy, which policies start from",
-                policies.agent_of(self.policies)[1].hidden_sizes,
-            )
 
     @property
     def num_groups(self) -> int:
@@ -81,6 +67,49 @@ class RepresentConfig:
         if self.grouping == "separate":
             return strategy_names(self.num_strategies)
         return (self.grouping,)
+
+    @property
+    def merged_name(self) -> str:
+        """What a single reward or policy is called: "task", or the strategy it comes from alone."""
+        return "task" if self.grouping in ("separate", "merged") else self.grouping
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        """Names of the rewards, or policies, that a run learns."""
+        return (self.merged_name,)
+
+
+@dataclasses.dataclass(frozen=True)
+class RepresentConfig(MethodConfig):
+    """Settings of REPRESENT, and of SSRR on the same stages.
+
+    Attributes:
+      airl, noise, curve, regression, policies: settings of the stages.
+    """
+
+    airl: AirlConfig = AirlConfig()
+    noise: NoiseConfig = NoiseConfig()
+    curve: CurveConfig = CurveConfig()
+    regression: RegressionConfig = RegressionConfig()
+    policies: PoliciesConfig = PoliciesConfig()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.policies.start == "phase1":
+            _, settings = airl.generator(self.airl)
+            require(
+                policies.agent_of(self.policies)[1].hidden_sizes == settings.hidden_sizes,
+                f"policies.{self.policies.agent}.hidden_sizes",
+                f"{settings.hidden_sizes}, those of Phase 1's policy, which policies start from",
+                policies.agent_of(self.policies)[1].hidden_sizes,
+            )
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        """ "task", "strategy_1", ...; one name where nothing is decomposed (alpha = 0)."""
+        if self.regression.strategy_weight == 0.0:
+            return (self.merged_name,)
+        return ("task", *strategy_names(self.num_groups))
 
 
 class Problem(NamedTuple):
@@ -98,7 +127,7 @@ class Problem(NamedTuple):
 
 
 def make_problem(
-    config: RepresentConfig, env: Environment, demonstrations: Demonstrations, test: Demonstrations
+    config: MethodConfig, env: Environment, demonstrations: Demonstrations, test: Demonstrations
 ) -> Problem:
     """Checks demonstrations and test trajectories against the environment and cuts them to size.
 
@@ -139,14 +168,3 @@ def _truncate(t: Trajectory, horizon: int) -> Trajectory:
 def strategy_names(num_strategies: int) -> tuple[str, ...]:
     """ "strategy_1", "strategy_2", ..."""
     return tuple(f"strategy_{i + 1}" for i in range(num_strategies))
-
-
-def target_names(config: RepresentConfig) -> tuple[str, ...]:
-    """Names of the rewards a run learns: "task", "strategy_1", ...
-
-    Where nothing is decomposed (alpha = 0) there is one: "task", or the strategy it was learned
-    from alone.
-    """
-    if config.regression.strategy_weight == 0.0:
-        return ("task",) if config.grouping in ("separate", "merged") else (config.grouping,)
-    return ("task", *strategy_names(config.num_groups))

@@ -4,7 +4,7 @@ A stage itself (`represent_jax.stages`) knows of none of these. Methods call the
 the order that makes the method.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -15,12 +15,12 @@ from represent_jax.agents.sac import PolicyParams
 from represent_jax.data.trajectories import Demonstrations, Trajectory, TrajectoryBatch, pad
 from represent_jax.envs import Episode
 from represent_jax.errors import RepresentError
-from represent_jax.methods.config import Problem, RepresentConfig, target_names
+from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.population import Population, stack
 from represent_jax.runs import RunDirectory
 from represent_jax.runs.loop import advance
-from represent_jax.stages import airl, curve, noise, policies, regression
-from represent_jax.types import RewardFn, Transition
+from represent_jax.stages import airl, bc, bc_rnn, curve, msrd, noise, policies, regression
+from represent_jax.types import Metrics, Params, PolicyFn, RewardFn, Transition
 
 # --- Phase 1 ---
 
@@ -105,21 +105,39 @@ def run_noise(
     directory: RunDirectory,
 ) -> noise.NoisyData:
     """Phase 2's rollouts; leaves of the result are `[num_strategies, ...]`."""
-    env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
 
     def policy(params, obs_t, key):
-        return airl.act(params, obs_t, key, config.airl, env.action_size)
+        return airl.act(params, obs_t, key, config.airl, problem.env.action_size)
 
     def reward(params, obs_t, action_t, next_obs_t):
         return airl.reward(params, obs_t, action_t, next_obs_t, config.airl)
 
-    def one(key, first):
-        return noise.run(key, env, policy, first.policy, reward, first.reward, config.noise)
+    return run_rollouts(
+        key, config.noise, problem.env, policy, first.policy, reward, first.reward, directory
+    )
 
-    keys = jax.random.split(key, problem.demonstrations.num_strategies)
+
+def run_rollouts(
+    key: jax.Array,
+    config: noise.NoiseConfig,
+    env: Episode,
+    policy: PolicyFn,
+    policy_params: Params,
+    reward_fn: RewardFn,
+    reward_params: Params,
+    directory: RunDirectory,
+) -> noise.NoisyData:
+    """Noisy rollouts of any policies; parameters and result are `[num_policies, ...]`."""
+    whole = Episode(env.env, env.horizon, auto_reset=False)
+
+    def one(key, policy_params, reward_params):
+        return noise.run(key, whole, policy, policy_params, reward_fn, reward_params, config)
+
+    keys = jax.random.split(key, jax.tree.leaves(policy_params)[0].shape[0])
+    inputs = (keys, policy_params, reward_params)
     if directory.is_done("noise"):
-        return directory.load_output("noise", jax.eval_shape(jax.vmap(one), keys, first))
-    output = jax.block_until_ready(jax.jit(jax.vmap(one))(keys, first))
+        return directory.load_output("noise", jax.eval_shape(jax.vmap(one), *inputs))
+    output = jax.block_until_ready(jax.jit(jax.vmap(one))(*inputs))
     directory.save_output("noise", output)
     return output
 
@@ -161,31 +179,73 @@ def run_regression(
     def init(key):
         return regression.init(key, *sizes, config.regression)
 
-    if directory.is_done("regression"):
-        return directory.load_output("regression", jax.eval_shape(init, key).rewards)
     targets = jnp.repeat(curves.fitted, config.noise.trajectories_per_level, axis=1)
-    data = regression.RegressionData(noisy.trajectories, targets, _padded_demonstrations(problem))
-    updates_per_chunk = max(1, config.regression.num_updates // 20)
-    compiled = jax.jit(
-        lambda state, data: regression.train(state, data, config.regression, updates_per_chunk),
-        donate_argnums=0,
-    )
-    state = advance(
-        directory,
+    data = regression.RegressionData(noisy.trajectories, targets, padded_demonstrations(problem))
+
+    def train(state, data, num_updates):
+        return regression.train(state, data, config.regression, num_updates)
+
+    return run_updates(
         "regression",
-        jax.jit(init)(key),
-        lambda state: compiled(state, data),
-        -(-config.regression.num_updates // updates_per_chunk),
-        units_per_chunk=updates_per_chunk,
-        unit="updates",
-        checkpoint_seconds=checkpoint_seconds,
+        key,
+        init,
+        train,
+        data,
+        lambda state: state.rewards,
+        config.regression.num_updates,
+        directory,
+        checkpoint_seconds,
         describe=lambda m: "loss " + _numbers(m["ssrr_loss"]),
     )
-    directory.save_output("regression", state.rewards)
-    return state.rewards
 
 
-def _padded_demonstrations(problem: Problem) -> TrajectoryBatch:
+def run_updates(
+    stage: str,
+    key: jax.Array,
+    init: Callable[[jax.Array], Any],
+    train: Callable[[Any, Any, int], tuple[Any, Metrics]],
+    data: Any,
+    finish: Callable[[Any], Any],
+    num_updates: int,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+    describe: Callable[[Metrics], str] | None = None,
+) -> Any:
+    """Supervised learning in twenty chunks; returns and saves what `finish` reads.
+
+    Args:
+      stage: its name in the run directory.
+      key: PRNG key.
+      init: `init(key)`, the state to begin with.
+      train: `train(state, data, num_updates)`, the state after them, and metrics.
+      data: what it learns from; an argument of the compiled program, not a constant in it.
+      finish: reads the stage's output from the last state.
+      num_updates: budget.
+      directory: where the stage is saved, and restored from.
+      checkpoint_seconds: least time between two checkpoints.
+      describe: what to show of the metrics beside the progress.
+    """
+    if directory.is_done(stage):
+        return directory.load_output(stage, finish(jax.eval_shape(init, key)))
+    per_chunk = max(1, num_updates // 20)
+    compiled = jax.jit(lambda state, data: train(state, data, per_chunk), donate_argnums=0)
+    state = advance(
+        directory,
+        stage,
+        jax.jit(init)(key),
+        lambda state: compiled(state, data),
+        -(-num_updates // per_chunk),
+        units_per_chunk=per_chunk,
+        unit="updates",
+        checkpoint_seconds=checkpoint_seconds,
+        describe=describe,
+    )
+    output = finish(state)
+    directory.save_output(stage, output)
+    return output
+
+
+def padded_demonstrations(problem: Problem) -> TrajectoryBatch:
     """Demonstrations `[num_strategies, num_demonstrations]`, repeated to one common number."""
     demonstrations = problem.demonstrations
     groups = [demonstrations.of_strategy(i) for i in range(demonstrations.num_strategies)]
@@ -194,6 +254,92 @@ def _padded_demonstrations(problem: Problem) -> TrajectoryBatch:
         pad([group[j % len(group)] for j in range(most)], problem.env.horizon) for group in groups
     ]
     return stack(padded)
+
+
+# --- Baselines ---
+
+
+def run_bc(
+    key: jax.Array,
+    config: bc.BcConfig,
+    problem: Problem,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> Params:
+    """Behavioural cloning of all demonstrations together."""
+    key_split, key = jax.random.split(key)
+    every = _transitions(problem.demonstrations.trajectories)
+    data = bc.split(key_split, every, config)
+    return run_updates(
+        "bc",
+        key,
+        lambda key: bc.init(key, data.train, config),
+        lambda state, data, num_updates: bc.train(state, data, config, num_updates),
+        data,
+        bc.finish,
+        config.num_updates,
+        directory,
+        checkpoint_seconds,
+    )
+
+
+def run_bc_rnn(
+    key: jax.Array,
+    config: bc_rnn.BcRnnConfig,
+    problem: Problem,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> bc_rnn.BcRnnParams:
+    """Recurrent behavioural cloning of all demonstrations together."""
+    data = pad(problem.demonstrations.trajectories, problem.env.horizon)
+    data = jax.tree.map(jnp.asarray, data)
+    return run_updates(
+        "bc_rnn",
+        key,
+        lambda key: bc_rnn.init(key, data, config),
+        lambda state, data, num_updates: bc_rnn.train(state, data, config, num_updates),
+        data,
+        bc_rnn.finish,
+        config.num_updates,
+        directory,
+        checkpoint_seconds,
+    )
+
+
+def run_msrd(
+    key: jax.Array,
+    config: msrd.MsrdConfig,
+    problem: Problem,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> msrd.MsrdOutput:
+    """MSRD's joint training of all strategies."""
+    demonstrations = stack(transitions_of(problem.demonstrations))
+
+    def init(key):
+        return msrd.init(key, problem.env, demonstrations, config)
+
+    if directory.is_done("msrd"):
+        return directory.load_output("msrd", msrd.finish(jax.eval_shape(init, key)))
+    per_step = config.sac.env_steps_per_step
+    chunk_env_steps = _chunk(config.env_steps, per_step)
+    num_steps = chunk_env_steps // per_step
+    state = advance(
+        directory,
+        "msrd",
+        jax.jit(init)(key),
+        jax.jit(
+            lambda state: msrd.train(state, problem.env, demonstrations, config, num_steps),
+            donate_argnums=0,
+        ),
+        -(-config.env_steps // chunk_env_steps),
+        units_per_chunk=chunk_env_steps,
+        checkpoint_seconds=checkpoint_seconds,
+        describe=lambda m: "discriminator " + _numbers(m["discriminator_loss"]),
+    )
+    output = msrd.finish(state)
+    directory.save_output("msrd", output)
+    return output
 
 
 # --- Policies ---
@@ -208,7 +354,7 @@ def objectives_of(
         policies.make_objective(
             regression.view(rewards, strategy, config.regression), scale, env, config.policies
         )
-        for strategy in (None, *range(len(target_names(config)) - 1))
+        for strategy in (None, *range(len(config.target_names) - 1))
     ]
 
 
@@ -227,7 +373,7 @@ def run_policies(
     env: Episode,
     objectives: Sequence[policies.Objective],
     reward_fn: RewardFn,
-    starts: Sequence[PolicyParams],
+    starts: Sequence[PolicyParams] | None,
     directory: RunDirectory,
     checkpoint_seconds: float,
 ) -> PolicyParams:
@@ -240,12 +386,14 @@ def run_policies(
       objectives: what to maximise. The first is the task's: it starts from the policy of highest
         learned task return; the others start from `starts` in order.
       reward_fn: the reward whose parameters the objectives hold.
-      starts: Phase 1's policies.
+      starts: Phase 1's policies; None where there are none, for a cold start.
       directory: where the stage is saved, and restored from.
       checkpoint_seconds: least time between two checkpoints.
     """
     settings = config.policies
     key_start, key = jax.random.split(key)
+    if starts is None:
+        starts = [_random_policy(key_start, env, settings)] * len(objectives)
 
     def init(key, member):
         return policies.init(key, env, *member, settings, reward_fn)
@@ -279,6 +427,11 @@ def run_policies(
     output = stack([policies.finish(state, settings) for state in population.members(states)])
     directory.save_output("policies", output)
     return output
+
+
+def _random_policy(key: jax.Array, env: Episode, config: policies.PoliciesConfig) -> PolicyParams:
+    agent, settings = policies.agent_of(config)
+    return agent.policy_of(agent.init_learner(key, env.observation_size, env.action_size, settings))
 
 
 def _best_start(

@@ -1,43 +1,50 @@
-"""Settings by preset: `smoke` for tests, `quick` for a laptop, `paper` for the full protocol."""
+"""Settings by preset: `smoke` for tests, `quick` for a laptop, `paper` for the full protocol.
 
-from collections.abc import Callable
+A preset says what each stage is set to; a method takes the stages it has.
+"""
+
+import dataclasses
+from typing import Any
 
 from represent_jax.agents.ppo import PpoConfig
 from represent_jax.agents.sac import SacConfig
 from represent_jax.errors import unknown
-from represent_jax.methods.config import RepresentConfig
+from represent_jax.methods.config import MethodConfig
+from represent_jax.methods.registry import find_method
 from represent_jax.stages.airl import AirlConfig
+from represent_jax.stages.bc import BcConfig
+from represent_jax.stages.bc_rnn import BcRnnConfig
 from represent_jax.stages.discriminator import DiscriminatorConfig
+from represent_jax.stages.msrd import MsrdConfig
 from represent_jax.stages.noise import NoiseConfig
 from represent_jax.stages.policies import PoliciesConfig
+from represent_jax.stages.preference import PreferenceConfig
 from represent_jax.stages.regression import RegressionConfig
 
+_TINY_SAC = SacConfig(
+    num_envs=4,
+    updates_per_step=1,
+    batch_size=8,
+    buffer_capacity=400,
+    warmup_env_steps=8,
+    hidden_sizes=(8, 8),
+)
+_TINY_PPO = PpoConfig(num_envs=4, unroll_length=5, num_minibatches=2, hidden_sizes=(8, 8))
 
-def _smoke(env: str) -> RepresentConfig:
-    tiny = SacConfig(
-        num_envs=4,
-        updates_per_step=1,
-        batch_size=8,
-        buffer_capacity=400,
-        warmup_env_steps=8,
-        hidden_sizes=(8, 8),
-    )
-    tiny_ppo = PpoConfig(num_envs=4, unroll_length=5, num_minibatches=2, hidden_sizes=(8, 8))
-    return RepresentConfig(
-        env=env,
-        preset="smoke",
-        horizon=20,
-        airl=AirlConfig(
+PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": {
+        "horizon": 20,
+        "airl": AirlConfig(
             env_steps=160,
             cloning_updates=5,
             discriminator=DiscriminatorConfig(
                 hidden_sizes=(8, 8), batch_size=8, updates_per_step=1
             ),
-            sac=tiny,
-            ppo=tiny_ppo,
+            sac=_TINY_SAC,
+            ppo=_TINY_PPO,
         ),
-        noise=NoiseConfig(num_levels=5, level_step=0.2, trajectories_per_level=2),
-        regression=RegressionConfig(
+        "noise": NoiseConfig(num_levels=5, level_step=0.2, trajectories_per_level=2),
+        "regression": RegressionConfig(
             num_updates=20,
             num_snippets=4,
             states_per_snippet=2,
@@ -47,42 +54,43 @@ def _smoke(env: str) -> RepresentConfig:
             hidden_sizes=(8, 8),
             ensemble_size=2,
         ),
-        policies=PoliciesConfig(
-            env_steps=160, eval_env_steps=40, eval_episodes=2, sac=tiny, ppo=tiny_ppo
+        "preference": PreferenceConfig(
+            num_updates=20, num_pairs=4, snippet_steps=5, hidden_sizes=(8, 8), ensemble_size=2
         ),
-    )
-
-
-def _quick(env: str) -> RepresentConfig:
-    return RepresentConfig(
-        env=env,
-        preset="quick",
-        policies=PoliciesConfig(env_steps=320_000),
-    )
-
-
-def _paper(env: str) -> RepresentConfig:
-    return RepresentConfig(
-        env=env,
-        preset="paper",
-        regression=RegressionConfig(ensemble_size=5),
-        policies=PoliciesConfig(env_steps=1_000_000),
-    )
-
-
-PRESETS: dict[str, Callable[[str], RepresentConfig]] = {
-    "smoke": _smoke,
-    "quick": _quick,
-    "paper": _paper,
+        "bc": BcConfig(num_updates=20, batch_size=8, hidden_sizes=(8, 8)),
+        "bc_rnn": BcRnnConfig(num_updates=20, batch_size=4, sequence_length=3, hidden_size=8),
+        "msrd": MsrdConfig(
+            env_steps=160,
+            cloning_updates=5,
+            hidden_sizes=(8, 8),
+            batch_size=8,
+            updates_per_step=1,
+            sac=_TINY_SAC,
+        ),
+        "policies": PoliciesConfig(
+            env_steps=160, eval_env_steps=40, eval_episodes=2, sac=_TINY_SAC, ppo=_TINY_PPO
+        ),
+    },
+    "quick": {
+        "bc_rnn": BcRnnConfig(num_updates=4_000),
+        "policies": PoliciesConfig(env_steps=320_000),
+    },
+    "paper": {
+        "regression": RegressionConfig(ensemble_size=5),
+        "policies": PoliciesConfig(env_steps=1_000_000),
+    },
 }
 
 
-def make_config(preset: str, env: str) -> RepresentConfig:
-    """Makes the settings of a preset for an environment.
+def make_config(preset: str, env: str, method: str = "represent") -> MethodConfig:
+    """Makes the settings of a preset for a method and an environment.
 
     Raises:
-      UsageError: no preset of that name.
+      UsageError: no preset, or no method, of that name.
     """
     if preset not in PRESETS:
         raise unknown("preset", preset, PRESETS)
-    return PRESETS[preset](env)
+    found = find_method(method)
+    has = {field.name for field in dataclasses.fields(found.config)}
+    settings = {name: value for name, value in PRESETS[preset].items() if name in has}
+    return found.configure(found.config(env=env, preset=preset, **settings))

@@ -3,8 +3,6 @@
 demonstrations -> airl -> noise and curve -> regression -> policies -> evaluation
 """
 
-import resource
-import time
 from typing import Any
 
 import jax
@@ -12,6 +10,7 @@ import jax
 from represent_jax.errors import unknown
 from represent_jax.methods import pipeline
 from represent_jax.methods import results as found
+from represent_jax.methods.clock import Clock
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.runs import RunDirectory
 
@@ -45,7 +44,7 @@ def run(
         raise unknown("stage", until, STAGES)
     stage_keys = jax.random.split(jax.random.PRNGKey(config.seed), len(STAGES))
     keys = dict(zip(STAGES, stage_keys, strict=True))
-    clock = _Clock(directory)
+    clock = Clock(directory)
     with clock("airl"):
         first = pipeline.run_airl(keys["airl"], config, problem, directory, checkpoint_seconds)
     if until == "airl":
@@ -79,35 +78,4 @@ def run(
         results = found.evaluate(
             keys["evaluation"], config, problem, first, noisy, curves, rewards, trained, directory
         )
-    results["seconds"] = clock.seconds
-    results["peak_memory_gib"] = round(
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2
-    )
-    directory.write_results(results)
-    return results
-
-
-class _Clock:
-    """Seconds spent in each stage, kept across restarts in the run's log."""
-
-    def __init__(self, directory: RunDirectory):
-        self._directory = directory
-        self.seconds: dict[str, float] = {}
-        for line in directory.read_log("clock"):
-            self._add(line)
-
-    def _add(self, line: dict[str, Any]) -> None:
-        name = line["name"]
-        self.seconds[name] = round(self.seconds.get(name, 0.0) + line["seconds"], 1)
-
-    def __call__(self, name: str) -> "_Clock":
-        self._name = name
-        return self
-
-    def __enter__(self) -> None:
-        self._start = time.monotonic()
-
-    def __exit__(self, *exception: object) -> None:
-        line = {"name": self._name, "seconds": time.monotonic() - self._start}
-        self._directory.log("clock", 0, line)
-        self._add(line)
+    return clock.finish(results)

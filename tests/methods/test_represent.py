@@ -146,6 +146,19 @@ def test_ssrr_on_merged_demonstrations_and_on_one_strategy(tmp_path):
     )
 
 
+@pytest.mark.parametrize("method", ["drex", "msrd", "bc", "bc_rnn"])
+def test_baselines_run_to_their_end(tmp_path, method):
+    record = tmp_path / "records.jsonl"
+    out = tmp_path / method
+    _finish(_launch(out, f"--method={method}", "--backend=mujoco", f"--record={record}"))
+    results = _results(out)
+    finals = [policy["return_final"] for policy in results["policies"].values()]
+    assert finals and np.isfinite(finals).all()
+    lines = [json.loads(line) for line in record.read_text().splitlines()]
+    assert {line["method"] for line in lines} == {method}
+    assert rj.api.load_config(out).method == method
+
+
 def test_evaluate_judges_a_finished_run(finished):
     out, _, _ = finished
     command = [sys.executable, "-m", "experiments.evaluate", f"--run={out}", "--backend=mujoco"]
