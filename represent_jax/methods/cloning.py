@@ -1,6 +1,7 @@
 """BC and BC-RNN: the demonstrations of all strategies cloned by one policy, or one strategy's."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -8,8 +9,8 @@ import jax.numpy as jnp
 
 from represent_jax.agents import rollout as rollouts
 from represent_jax.config import require
-from represent_jax.envs import Episode
-from represent_jax.errors import unknown
+from represent_jax.envs import Environment, Episode
+from represent_jax.errors import RepresentError, unknown
 from represent_jax.methods import pipeline, results
 from represent_jax.methods.clock import Clock
 from represent_jax.methods.config import MethodConfig, Problem
@@ -17,6 +18,7 @@ from represent_jax.runs import RunDirectory
 from represent_jax.stages import bc, bc_rnn
 from represent_jax.stages.bc import BcConfig
 from represent_jax.stages.bc_rnn import BcRnnConfig
+from represent_jax.types import Transition
 
 STAGES = ("training", "evaluation")
 
@@ -123,3 +125,29 @@ def _run(config, problem, directory, until, train, episodes):
             key_evaluation, config, problem, policies, {}, directory
         )
     return clock.finish(found)
+
+
+def load_no_rewards(config: MethodConfig, env: Environment, directory: RunDirectory) -> dict:
+    """Raises: cloning learns no reward."""
+    raise RepresentError(f"{directory.path}: a run of {config.method}, which learns no reward")
+
+
+def load_bc_policies(
+    config: BcMethodConfig, env: Environment, directory: RunDirectory
+) -> dict[str, Callable[[jax.Array], jax.Array]]:
+    """The policy of a run, by its only target."""
+    obs, nothing = jnp.zeros((1, env.observation_size)), jnp.zeros(1)
+    rows = Transition(obs, jnp.zeros((1, env.action_size)), obs, nothing, nothing, nothing)
+    key = jax.random.PRNGKey(0)
+    example = jax.eval_shape(lambda key: bc.finish(bc.init(key, rows, config.bc)), key)
+    params = directory.load_output("bc", example)
+    return {config.merged_name: lambda obs: bc.act(params, obs, key, config.bc, env.action_size)}
+
+
+def load_no_recurrent_policies(
+    config: BcRnnMethodConfig, env: Environment, directory: RunDirectory
+) -> dict:
+    """Raises: a recurrent policy is no function of observations alone."""
+    raise RepresentError(
+        f"{directory.path}: the policy of bc_rnn carries a hidden state; see stages/bc_rnn.py, act"
+    )

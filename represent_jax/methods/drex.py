@@ -7,6 +7,7 @@ prefers less noise. Its policy is SAC's, as in the paper's Table II; D-REX's own
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 from represent_jax.agents import rollout as rollouts
 from represent_jax.config import require
 from represent_jax.data.trajectories import TrajectoryBatch
+from represent_jax.envs import Environment
 from represent_jax.errors import unknown
 from represent_jax.methods import pipeline, results
 from represent_jax.methods.clock import Clock
@@ -168,6 +170,25 @@ def run(
             key_policies, config, problem, {name: episodes}, {name: learned}, directory
         )
     return clock.finish(found)
+
+
+def load_rewards(
+    config: DrexConfig, env: Environment, directory: RunDirectory
+) -> dict[str, Callable[..., jax.Array]]:
+    """The reward of a run, by its only target."""
+    example = jax.eval_shape(
+        lambda key: preference.init(key, env.observation_size, config.preference),
+        jax.random.PRNGKey(0),
+    )
+    params = directory.load_output("preference", example.params)
+    return {config.merged_name: lambda *rows: preference.reward(params, *rows, config.preference)}
+
+
+def load_policies(
+    config: DrexConfig, env: Environment, directory: RunDirectory
+) -> dict[str, Callable[[jax.Array], jax.Array]]:
+    """The policy of a run, by its only target."""
+    return pipeline.load_agents(config.policies, config.target_names, env, directory)
 
 
 def _run_preference(key, config, env, batch: TrajectoryBatch, directory, checkpoint_seconds):

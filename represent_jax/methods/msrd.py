@@ -5,6 +5,7 @@ to REPRESENT, SSRR and D-REX only.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 
 from represent_jax.agents import rollout as rollouts
 from represent_jax.config import require
-from represent_jax.envs import Episode
+from represent_jax.envs import Environment, Episode
 from represent_jax.errors import unknown
 from represent_jax.methods import pipeline, results
 from represent_jax.methods.clock import Clock
@@ -20,6 +21,7 @@ from represent_jax.methods.config import MethodConfig, Problem, strategy_names
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import msrd
 from represent_jax.stages.msrd import MsrdConfig
+from represent_jax.types import Transition
 
 STAGES = ("msrd", "evaluation")
 
@@ -88,3 +90,43 @@ def run(
             key_evaluation, config, problem, episodes, learned, directory
         )
     return clock.finish(found)
+
+
+def load_rewards(
+    config: MsrdMethodConfig, env: Environment, directory: RunDirectory
+) -> dict[str, Callable[..., jax.Array]]:
+    """R^0 and every R^i of a run, by target."""
+    rewards = _load(config, env, directory).rewards
+
+    def reward_of(strategy):
+        return lambda *rows: msrd.reward(rewards, *rows, config.msrd, strategy)
+
+    names = config.target_names
+    return {name: reward_of(i - 1 if i else None) for i, name in enumerate(names)}
+
+
+def load_policies(
+    config: MsrdMethodConfig, env: Environment, directory: RunDirectory
+) -> dict[str, Callable[[jax.Array], jax.Array]]:
+    """The generators of a run, by strategy: there is none of the task's."""
+    stacked, key = _load(config, env, directory).policies, jax.random.PRNGKey(0)
+
+    def policy_of(i):
+        params = jax.tree.map(lambda x: x[i], stacked)
+        return lambda obs: msrd.act(
+            params, obs, key, config.msrd, env.action_size, deterministic=True
+        )
+
+    return {name: policy_of(i) for i, name in enumerate(config.group_names)}
+
+
+def _load(config: MsrdMethodConfig, env: Environment, directory: RunDirectory) -> msrd.MsrdOutput:
+    shape = (config.num_groups, 1)
+    obs, nothing = jnp.zeros((*shape, env.observation_size)), jnp.zeros(shape)
+    action = jnp.zeros((*shape, env.action_size))
+    rows = Transition(obs, action, obs, nothing, nothing, nothing)
+    episode = Episode(env, config.horizon or env.horizon)
+    example = jax.eval_shape(
+        lambda key: msrd.finish(msrd.init(key, episode, rows, config.msrd)), jax.random.PRNGKey(0)
+    )
+    return directory.load_output("msrd", example)

@@ -13,7 +13,7 @@ import numpy as np
 
 from represent_jax.agents.sac import PolicyParams
 from represent_jax.data.trajectories import Demonstrations, Trajectory, TrajectoryBatch, pad
-from represent_jax.envs import Episode
+from represent_jax.envs import Environment, Episode
 from represent_jax.errors import RepresentError
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.population import Population, stack
@@ -427,6 +427,28 @@ def run_policies(
     output = stack([policies.finish(state, settings) for state in population.members(states)])
     directory.save_output("policies", output)
     return output
+
+
+def load_agents(
+    config: policies.PoliciesConfig,
+    names: Sequence[str],
+    env: Environment,
+    directory: RunDirectory,
+) -> dict[str, Callable[[jax.Array], jax.Array]]:
+    """What `run_policies` saved, as deterministic functions of observations, by name."""
+    agent, settings = policies.agent_of(config)
+    key, action_dim = jax.random.PRNGKey(0), env.action_size
+    example = jax.eval_shape(lambda key: _random_policy(key, env, config), key)
+    stacked = directory.load_output(
+        "policies", jax.tree.map(lambda x: _shape_like(x, len(names)), example)
+    )
+
+    def policy_of(i):
+        params = jax.tree.map(lambda x: x[i], stacked)
+        # The key is not used: actions are modes.
+        return lambda obs: agent.act(params, obs, key, settings, action_dim, deterministic=True)
+
+    return {name: policy_of(i) for i, name in enumerate(names)}
 
 
 def _random_policy(key: jax.Array, env: Episode, config: policies.PoliciesConfig) -> PolicyParams:

@@ -3,9 +3,13 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
+
 from represent_jax.errors import unknown
 from represent_jax.methods import cloning, drex, msrd, represent, ssrr
 from represent_jax.methods.config import MethodConfig, RepresentConfig
+
+Loader = Callable[..., dict[str, Callable[..., jax.Array]]]
 
 
 def _unchanged(config: MethodConfig) -> MethodConfig:
@@ -19,22 +23,59 @@ class Method(NamedTuple):
       config: class of its settings.
       run: runs its stages, `run(config, problem, directory, checkpoint_seconds, until)`.
       stages: their names, in order.
+      load_rewards, load_policies: from settings, environment and run directory to functions
+        `reward(obs_t, action_t, next_obs_t)` and `policy(obs)`, by target.
       configure: turns a preset's settings into those of the method.
     """
 
     config: type[MethodConfig]
     run: Callable
     stages: tuple[str, ...]
+    load_rewards: Loader
+    load_policies: Loader
     configure: Callable[[MethodConfig], MethodConfig] = _unchanged
 
 
+_REPRESENT = Method(
+    config=RepresentConfig,
+    run=represent.run,
+    stages=represent.STAGES,
+    load_rewards=represent.load_rewards,
+    load_policies=represent.load_policies,
+)
+
 METHODS: dict[str, Method] = {
-    "represent": Method(RepresentConfig, represent.run, represent.STAGES),
-    "ssrr": Method(RepresentConfig, represent.run, represent.STAGES, ssrr.configure),
-    "drex": Method(drex.DrexConfig, drex.run, drex.STAGES, drex.configure),
-    "msrd": Method(msrd.MsrdMethodConfig, msrd.run, msrd.STAGES),
-    "bc": Method(cloning.BcMethodConfig, cloning.run_bc, cloning.STAGES),
-    "bc_rnn": Method(cloning.BcRnnMethodConfig, cloning.run_bc_rnn, cloning.STAGES),
+    "represent": _REPRESENT,
+    "ssrr": _REPRESENT._replace(configure=ssrr.configure),
+    "drex": Method(
+        config=drex.DrexConfig,
+        run=drex.run,
+        stages=drex.STAGES,
+        load_rewards=drex.load_rewards,
+        load_policies=drex.load_policies,
+        configure=drex.configure,
+    ),
+    "msrd": Method(
+        config=msrd.MsrdMethodConfig,
+        run=msrd.run,
+        stages=msrd.STAGES,
+        load_rewards=msrd.load_rewards,
+        load_policies=msrd.load_policies,
+    ),
+    "bc": Method(
+        config=cloning.BcMethodConfig,
+        run=cloning.run_bc,
+        stages=cloning.STAGES,
+        load_rewards=cloning.load_no_rewards,
+        load_policies=cloning.load_bc_policies,
+    ),
+    "bc_rnn": Method(
+        config=cloning.BcRnnMethodConfig,
+        run=cloning.run_bc_rnn,
+        stages=cloning.STAGES,
+        load_rewards=cloning.load_no_rewards,
+        load_policies=cloning.load_no_recurrent_policies,
+    ),
 }
 
 

@@ -3,16 +3,19 @@
 demonstrations -> airl -> noise and curve -> regression -> policies -> evaluation
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 
+from represent_jax.envs import Environment
 from represent_jax.errors import unknown
 from represent_jax.methods import pipeline
 from represent_jax.methods import results as found
 from represent_jax.methods.clock import Clock
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.runs import RunDirectory
+from represent_jax.stages import regression
 
 STAGES = ("airl", "noise", "regression", "policies", "evaluation")
 
@@ -79,3 +82,27 @@ def run(
             keys["evaluation"], config, problem, first, noisy, curves, rewards, trained, directory
         )
     return clock.finish(results)
+
+
+def load_rewards(
+    config: RepresentConfig, env: Environment, directory: RunDirectory
+) -> dict[str, Callable[..., jax.Array]]:
+    """R^0 and every R^i of a run, by target."""
+    sizes = (env.observation_size, env.action_size, config.num_groups)
+    example = jax.eval_shape(
+        lambda key: regression.init(key, *sizes, config.regression), jax.random.PRNGKey(0)
+    )
+    rewards = directory.load_output("regression", example.rewards)
+
+    def reward_of(strategy):
+        return lambda *rows: regression.reward(rewards, *rows, config.regression, strategy)
+
+    names = config.target_names
+    return {name: reward_of(i - 1 if i else None) for i, name in enumerate(names)}
+
+
+def load_policies(
+    config: RepresentConfig, env: Environment, directory: RunDirectory
+) -> dict[str, Callable[[jax.Array], jax.Array]]:
+    """The policies of a run, by target."""
+    return pipeline.load_agents(config.policies, config.target_names, env, directory)

@@ -156,7 +156,18 @@ def test_baselines_run_to_their_end(tmp_path, method):
     assert finals and np.isfinite(finals).all()
     lines = [json.loads(line) for line in record.read_text().splitlines()]
     assert {line["method"] for line in lines} == {method}
-    assert rj.api.load_config(out).method == method
+    obs, action = np.zeros((3, 17), np.float32), np.zeros((3, 6), np.float32)
+    if method in ("drex", "msrd"):
+        assert rj.load_reward(out)(obs, action, obs).shape == (3,)
+    else:
+        with pytest.raises(RepresentError, match="no reward"):
+            rj.load_reward(out)
+    if method == "bc_rnn":
+        with pytest.raises(RepresentError, match="hidden state"):
+            rj.load_policy(out)
+    else:
+        target = next(iter(results["policies"]))
+        assert rj.load_policy(out, target)(obs).shape == (3, 6)
 
 
 def test_evaluate_judges_a_finished_run(finished):
