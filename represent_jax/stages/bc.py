@@ -11,10 +11,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from flax import linen, struct
+from flax import struct
 
 from represent_jax.config import require
 from represent_jax.errors import RepresentError
+from represent_jax.stages.mlp import Mlp, squared_kernels
 from represent_jax.types import Metrics, Params, Transition
 
 
@@ -81,22 +82,9 @@ class BcData(NamedTuple):
     validation: Transition
 
 
-class _Network(linen.Module):
-    hidden_sizes: tuple[int, ...]
-    kernel_scale: float
-    action_dim: int
-
-    @linen.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        kernel_init = jax.nn.initializers.normal(self.kernel_scale)
-        for size in self.hidden_sizes:
-            x = linen.relu(linen.Dense(size, kernel_init=kernel_init)(x))
-        return linen.Dense(self.action_dim, kernel_init=kernel_init)(x)
-
-
 @functools.lru_cache
-def _network(config: BcConfig, action_dim: int) -> _Network:
-    return _Network(config.hidden_sizes, config.kernel_scale, action_dim)
+def _network(config: BcConfig, action_dim: int) -> Mlp:
+    return Mlp(config.hidden_sizes, config.kernel_scale, action_dim)
 
 
 @functools.lru_cache
@@ -148,9 +136,7 @@ def squared_error(params: Params, rows: Transition, config: BcConfig) -> jax.Arr
 def loss(params: Params, rows: Transition, config: BcConfig) -> tuple[jax.Array, Metrics]:
     """Squared error and L2 on a batch `[batch_size]`."""
     error = squared_error(params, rows, config)
-    leaves = jax.tree_util.tree_leaves_with_path(params)
-    kernels = [leaf for path, leaf in leaves if path[-1].key == "kernel"]
-    l2 = config.l2 * sum(jnp.sum(jnp.square(kernel)) for kernel in kernels)
+    l2 = config.l2 * squared_kernels(params)
     return error + l2, {"loss": error + l2, "train_loss": error, "l2_loss": l2}
 
 

@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from flax import linen, struct
+from flax import struct
 
 from represent_jax.config import require
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.errors import RepresentError
+from represent_jax.stages.mlp import Mlp, squared_kernels
 from represent_jax.types import Metrics, Params
 
 # In float32 two levels may lie a little less apart than the decimals they stand for.
@@ -88,21 +89,9 @@ class Pairs(NamedTuple):
     mask: jax.Array
 
 
-class _Network(linen.Module):
-    hidden_sizes: tuple[int, ...]
-    kernel_scale: float
-
-    @linen.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        kernel_init = jax.nn.initializers.normal(self.kernel_scale)
-        for size in self.hidden_sizes:
-            x = linen.relu(linen.Dense(size, kernel_init=kernel_init)(x))
-        return linen.Dense(1, kernel_init=kernel_init)(x)[..., 0]
-
-
 @functools.lru_cache
-def _network(config: PreferenceConfig) -> _Network:
-    return _Network(config.hidden_sizes, config.kernel_scale)
+def _network(config: PreferenceConfig) -> Mlp:
+    return Mlp(config.hidden_sizes, config.kernel_scale)
 
 
 @functools.lru_cache
@@ -198,7 +187,7 @@ def loss(params: Params, pairs: Pairs, config: PreferenceConfig) -> tuple[jax.Ar
       config: settings.
     """
     margin = margins(params, pairs, config)
-    l2 = config.l2 * _squared_kernels(params)
+    l2 = config.l2 * squared_kernels(params)
     # Softmax cross-entropy of two logits depends on their difference only.
     total = jnp.mean(jax.nn.softplus(-margin)) + l2
     return total, {"loss": total, "accuracy": _share_positive(margin), "l2_loss": l2}
@@ -206,11 +195,6 @@ def loss(params: Params, pairs: Pairs, config: PreferenceConfig) -> tuple[jax.Ar
 
 def _share_positive(margin: jax.Array) -> jax.Array:
     return jnp.mean(0.5 * (1.0 + jnp.sign(margin)))
-
-
-def _squared_kernels(params: Params) -> jax.Array:
-    leaves = jax.tree_util.tree_leaves_with_path(params)
-    return sum(jnp.sum(jnp.square(leaf)) for path, leaf in leaves if path[-1].key == "kernel")
 
 
 def step(

@@ -19,10 +19,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from flax import linen, struct
+from flax import struct
 
 from represent_jax.config import require
 from represent_jax.data.trajectories import TrajectoryBatch
+from represent_jax.stages.mlp import Mlp, squared_kernels
 from represent_jax.types import Metrics, Params
 
 
@@ -163,21 +164,9 @@ class Snippets(NamedTuple):
     target: jax.Array
 
 
-class _Head(linen.Module):
-    hidden_sizes: tuple[int, ...]
-    kernel_scale: float
-
-    @linen.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        kernel_init = jax.nn.initializers.normal(self.kernel_scale)
-        for size in self.hidden_sizes:
-            x = linen.relu(linen.Dense(size, kernel_init=kernel_init)(x))
-        return linen.Dense(1, kernel_init=kernel_init)(x)[..., 0]
-
-
 @functools.lru_cache
-def _head(config: RegressionConfig) -> _Head:
-    return _Head(config.hidden_sizes, config.kernel_scale)
+def _head(config: RegressionConfig) -> Mlp:
+    return Mlp(config.hidden_sizes, config.kernel_scale)
 
 
 @functools.lru_cache
@@ -320,8 +309,8 @@ def loss(
     reg = jnp.sum(jnp.mean(jnp.square(rho_own), axis=(1, 2)))
     reg += jnp.sum(jnp.mean(jnp.square(rho_cross), axis=(1, 2)))
     bcd = discrimination_loss(utility, config)
-    l2 = config.l2 * _squared_kernels(rewards.task)
-    l2 += config.strategy_l2 * _squared_kernels(rewards.strategies)
+    l2 = config.l2 * squared_kernels(rewards.task)
+    l2 += config.strategy_l2 * squared_kernels(rewards.strategies)
     total = (
         config.lambda_ssrr * jnp.sum(ssrr) + config.lambda_reg * reg + config.lambda_bcd * bcd + l2
     )
@@ -337,11 +326,6 @@ def loss(
         "strategy_reward_others": others / jnp.maximum(num_strategies * (num_strategies - 1), 1),
     }
     return total, metrics
-
-
-def _squared_kernels(params: Params) -> jax.Array:
-    leaves = jax.tree_util.tree_leaves_with_path(params)
-    return sum(jnp.sum(jnp.square(leaf)) for path, leaf in leaves if path[-1].key == "kernel")
 
 
 def _sample_states(key: jax.Array, batch: TrajectoryBatch, config: RegressionConfig) -> jax.Array:
