@@ -8,12 +8,11 @@ import jax
 import jax.numpy as jnp
 
 from represent_jax.agents import rollout as rollouts
-from represent_jax.config import require
 from represent_jax.envs import Environment, Episode
 from represent_jax.errors import RepresentError, unknown
 from represent_jax.methods import pipeline, results
 from represent_jax.methods.clock import Clock
-from represent_jax.methods.config import MethodConfig, Problem
+from represent_jax.methods.config import MethodConfig, OneGroupConfig, Problem
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import bc, bc_rnn
 from represent_jax.stages.bc import BcConfig
@@ -24,7 +23,7 @@ STAGES = ("training", "evaluation")
 
 
 @dataclasses.dataclass(frozen=True)
-class BcMethodConfig(MethodConfig):
+class BcMethodConfig(OneGroupConfig):
     """Settings of behavioural cloning.
 
     Attributes:
@@ -32,16 +31,11 @@ class BcMethodConfig(MethodConfig):
     """
 
     method: str = "bc"
-    grouping: str = "merged"
     bc: BcConfig = BcConfig()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require_one_group(self)
 
 
 @dataclasses.dataclass(frozen=True)
-class BcRnnMethodConfig(MethodConfig):
+class BcRnnMethodConfig(OneGroupConfig):
     """Settings of recurrent behavioural cloning.
 
     Attributes:
@@ -49,17 +43,7 @@ class BcRnnMethodConfig(MethodConfig):
     """
 
     method: str = "bc_rnn"
-    grouping: str = "merged"
     bc_rnn: BcRnnConfig = BcRnnConfig()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _require_one_group(self)
-
-
-def _require_one_group(config: MethodConfig) -> None:
-    grouping = config.grouping
-    require(grouping != "separate", "grouping", "'merged' or one strategy", repr(grouping))
 
 
 def run_bc(

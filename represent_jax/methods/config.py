@@ -80,6 +80,19 @@ class MethodConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class OneGroupConfig(MethodConfig):
+    """Settings of a method that takes all demonstrations for those of one strategy."""
+
+    grouping: str = "merged"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            self.grouping != "separate", "grouping", "'merged' or one strategy", repr(self.grouping)
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class RepresentConfig(MethodConfig):
     """Settings of REPRESENT, and of SSRR on the same stages.
 

@@ -21,7 +21,7 @@ from represent_jax.envs import Environment
 from represent_jax.errors import unknown
 from represent_jax.methods import pipeline, results
 from represent_jax.methods.clock import Clock
-from represent_jax.methods.config import MethodConfig, Problem
+from represent_jax.methods.config import OneGroupConfig, Problem
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import bc, policies, preference
 from represent_jax.stages.airl import AirlConfig
@@ -34,7 +34,7 @@ STAGES = ("base", "noise", "preference", "policies", "evaluation")
 
 
 @dataclasses.dataclass(frozen=True)
-class DrexConfig(MethodConfig):
+class DrexConfig(OneGroupConfig):
     """Settings of D-REX.
 
     Attributes:
@@ -44,7 +44,6 @@ class DrexConfig(MethodConfig):
     """
 
     method: str = "drex"
-    grouping: str = "merged"
     base: str = "bc"
     bc: BcConfig = BcConfig()
     airl: AirlConfig = AirlConfig()
@@ -55,7 +54,6 @@ class DrexConfig(MethodConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.base in ("bc", "airl"), "base", "'bc' or 'airl'", self.base)
-        require(self.grouping != "separate", "grouping", "'merged' or one strategy", self.grouping)
 
 
 def configure(config: DrexConfig) -> DrexConfig:

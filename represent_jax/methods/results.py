@@ -114,13 +114,7 @@ def policy_episodes(
     config: policies.PoliciesConfig, env: Episode, policy: PolicyParams
 ) -> Episodes:
     """Deterministic episodes of a trained agent."""
-    agent, settings = policies.agent_of(config)
-    whole = Episode(env.env, env.horizon, auto_reset=False)
-
-    def act(params, obs_t, key):
-        return agent.act(params, obs_t, key, settings, env.action_size, deterministic=True)
-
-    return jax.jit(lambda key: rollouts.rollout(whole, act, policy, key, jnp.zeros(FINAL_EPISODES)))
+    return jax.jit(lambda key: policies.rollout(key, env, policy, FINAL_EPISODES, config))
 
 
 def _airl_returns(

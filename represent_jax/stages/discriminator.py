@@ -11,6 +11,7 @@ policy is to act so: w = pi(a|s) / (eta u + (1 - eta) pi(a|s)), with u the unifo
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -201,7 +202,9 @@ def loss(
     cross_entropy += 0.5 * jnp.mean(weight * jax.nn.softplus(logits_policy))
     penalty = jnp.zeros(())
     if config.gradient_penalty > 0.0:
-        penalty = _gradient_penalty(params, rows.expert, rows.policy, key, config)
+        penalty = gradient_penalty(
+            lambda transition: advantage(params, transition, config), params.std, rows, key
+        )
     metrics = {
         "discriminator_loss": cross_entropy,
         "gradient_penalty": penalty,
@@ -212,27 +215,32 @@ def loss(
     return cross_entropy + config.gradient_penalty * penalty, metrics
 
 
-def _gradient_penalty(
-    params: RewardParams,
-    expert: Transition,
-    policy: Transition,
-    key: jax.Array,
-    config: DiscriminatorConfig,
+def gradient_penalty(
+    advantage_fn: Callable[[Transition], jax.Array], std: jax.Array, rows: Rows, key: jax.Array
 ) -> jax.Array:
+    """Mean squared gradient norm of f between demonstrations and policy, `[]`.
+
+    Args:
+      advantage_fn: f of transitions, `[batch_size]`.
+      std: the demonstrations' spread, `[obs_dim]`.
+      rows: batches of one update.
+      key: PRNG key of the interpolation.
+    """
+    expert, policy = rows.expert, rows.policy
     mix = jax.random.uniform(key, (expert.obs_t.shape[0], 1))
 
     def between(a, b):
         return mix * a + (1.0 - mix) * b
 
     def f_of(obs_t, next_obs_t):
-        rows = policy._replace(obs_t=obs_t, next_obs_t=next_obs_t)
-        return jnp.sum(advantage(params, rows, config))
+        between_rows = policy._replace(obs_t=obs_t, next_obs_t=next_obs_t)
+        return jnp.sum(advantage_fn(between_rows))
 
     grads = jax.grad(f_of, argnums=(0, 1))(
         between(expert.obs_t, policy.obs_t), between(expert.next_obs_t, policy.next_obs_t)
     )
     # In units of the demonstrations' spread, so that the penalty does not depend on scales.
-    norm = sum(jnp.sum(jnp.square(grad * params.std), axis=-1) for grad in grads)
+    norm = sum(jnp.sum(jnp.square(grad * std), axis=-1) for grad in grads)
     return jnp.mean(norm)
 
 

@@ -32,7 +32,7 @@ from represent_jax.agents.sac import PolicyParams, SacConfig
 from represent_jax.config import require
 from represent_jax.envs.episode import Episode
 from represent_jax.stages.airl import AirlConfig
-from represent_jax.stages.discriminator import INPUT_CLIP, Rows
+from represent_jax.stages.discriminator import INPUT_CLIP, Rows, gradient_penalty
 from represent_jax.types import Metrics, Params, Transition
 
 
@@ -271,7 +271,9 @@ def loss(
     cross_entropy += 0.5 * jnp.mean(jax.nn.softplus(logits_policy))
     penalty = jnp.zeros(())
     if config.gradient_penalty > 0.0:
-        penalty = _gradient_penalty(own, rows.expert, rows.policy, key, config)
+        penalty = gradient_penalty(
+            lambda transition: advantage(own, transition, config), own.std, rows, key
+        )
     metrics = {
         "discriminator_loss": cross_entropy,
         "gradient_penalty": penalty,
@@ -282,21 +284,6 @@ def loss(
     }
     squares = config.task_l2 * task_square + config.strategy_l2 * strategy_square
     return cross_entropy + squares + config.gradient_penalty * penalty, metrics
-
-
-def _gradient_penalty(own, expert, policy, key, config):
-    mix = jax.random.uniform(key, (expert.obs_t.shape[0], 1))
-
-    def f_of(obs_t, next_obs_t):
-        rows = policy._replace(obs_t=obs_t, next_obs_t=next_obs_t)
-        return jnp.sum(advantage(own, rows, config))
-
-    grads = jax.grad(f_of, argnums=(0, 1))(
-        mix * expert.obs_t + (1.0 - mix) * policy.obs_t,
-        mix * expert.next_obs_t + (1.0 - mix) * policy.next_obs_t,
-    )
-    # In units of the demonstrations' spread, so that the penalty does not depend on scales.
-    return jnp.mean(sum(jnp.sum(jnp.square(grad * own.std), axis=-1) for grad in grads))
 
 
 def update_rewards(

@@ -101,8 +101,8 @@ class Evaluation(NamedTuple):
     """Deterministic episodes of a policy.
 
     Attributes:
-      true_return: return under the environment's reward, `[]` where averaged.
-      learned_return: return under the learned reward R, `[]` where averaged.
+      true_return: mean return under the environment's reward, `[]`.
+      learned_return: mean return under the learned reward R, `[]`.
     """
 
     true_return: jax.Array
@@ -207,26 +207,23 @@ def evaluate(
     reward_fn: RewardFn,
 ) -> Evaluation:
     """Runs deterministic episodes; the true return is only ever reported, never used."""
-    _, result = rollout(key, env, objective, policy, config.eval_episodes, config, reward_fn)
-    return jax.tree.map(jnp.mean, result)
+    batch = rollout(key, env, policy, config.eval_episodes, config)
+    learned = rollouts.learned_returns(batch, reward_fn, objective.params)
+    return Evaluation(jnp.mean(rollouts.true_returns(batch)), jnp.mean(learned))
 
 
 def rollout(
     key: jax.Array,
     env: Episode,
-    objective: Objective,
     policy: PolicyParams,
     num_episodes: int,
     config: PoliciesConfig,
-    reward_fn: RewardFn,
-) -> tuple[TrajectoryBatch, Evaluation]:
-    """Runs deterministic episodes; returns them and both returns of each, `[num_episodes]`."""
+) -> TrajectoryBatch:
+    """Runs deterministic episodes of the agent's policy, `[num_episodes]`."""
     whole = Episode(env.env, env.horizon, auto_reset=False)
     agent, settings = agent_of(config)
 
     def act(params, obs_t, key):
         return agent.act(params, obs_t, key, settings, env.action_size, deterministic=True)
 
-    batch = rollouts.rollout(whole, act, policy, key, jnp.zeros(num_episodes))
-    learned = rollouts.learned_returns(batch, reward_fn, objective.params)
-    return batch, Evaluation(rollouts.true_returns(batch), learned)
+    return rollouts.rollout(whole, act, policy, key, jnp.zeros(num_episodes))
