@@ -52,6 +52,7 @@ def _make_demonstrations(config: demonstrators.DemonstratorConfig, path: Path) -
         config.target_returns,
         config.min_skill_accuracy,
         config.strategy_order,
+        config.steadiness_weight,
     )
     accuracy = style.pairwise_accuracy(trajectories)
     metadata = {

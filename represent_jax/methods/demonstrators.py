@@ -42,6 +42,10 @@ class DemonstratorConfig:
       demonstration_horizon: steps after which a demonstration is cut off; 0 is the environment's
         own. Where the wanted episodes end early by themselves, a lower one saves rolling out
         later skills in full at every snapshot.
+      learns_terminating: whether the agents learn where falling ends an episode, although they
+        demonstrate where it does not: otherwise lying down is a style.
+      steadiness_weight: weight, in judging a snapshot, of how much the two halves of its episodes
+        differ; by its mean return alone, who runs and then falls passes for one who walks.
       strategy_order: which of the chosen skills becomes which strategy; as chosen if empty.
       min_skill_accuracy: share of its states by which DIAYN's discriminator must know a skill
         before it can demonstrate.
@@ -59,6 +63,8 @@ class DemonstratorConfig:
     target_returns: tuple[float, ...] = (1243.13, 1172.71, 1181.35)
     trajectories_per_skill: int = 4
     demonstration_horizon: int = 0
+    learns_terminating: bool = False
+    steadiness_weight: float = 0.0
     strategy_order: tuple[int, ...] = ()
     min_skill_accuracy: float = 0.9
     test_snapshots: int = 18
@@ -107,8 +113,10 @@ DEMONSTRATORS = {
         test_env_steps=960_000,
         snapshot_env_steps=16_000,
         target_returns=(1197.93, 1587.98),
+        learns_terminating=True,
+        steadiness_weight=1.0,
         test_trajectories_per_skill=3,
-        diayn=DiaynConfig(num_skills=2, diversity_weight=0.5, sac=_SAC),
+        diayn=DiaynConfig(num_skills=2, diversity_weight=0.5, diversity_floor=0.0, sac=_SAC),
     ),
     "inverted_double_pendulum": DemonstratorConfig(
         env="inverted_double_pendulum",
@@ -156,7 +164,8 @@ def train(
 ) -> list[Snapshot]:
     """Trains one DIAYN agent and rolls out every skill at every snapshot."""
     env = make_env(config.env, backend)
-    episodes, whole = Episode(env), Episode(env, horizon or env.horizon, auto_reset=False)
+    learned = make_env(config.env, backend, terminates=True) if config.learns_terminating else env
+    episodes, whole = Episode(learned), Episode(env, horizon or env.horizon, auto_reset=False)
     diayn_config = config.diayn
     key_init, key_rollout = jax.random.split(jax.random.PRNGKey(seed))
     state = jax.jit(lambda key: diayn.init(key, episodes, diayn_config))(key_init)
@@ -213,13 +222,15 @@ def choose_demonstrations(
     target_returns: Sequence[float],
     min_skill_accuracy: float = 0.0,
     strategy_order: Sequence[int] = (),
+    steadiness_weight: float = 0.0,
 ) -> tuple[list[Trajectory], list[int]]:
     """Takes the demonstrations of each target return from the snapshot and skill nearest to it.
 
     A snapshot is judged by the relative error of its mean return plus the relative spread of its
     episodes: a demonstrator who half the time falls on its back has no style to learn from.
-    Skills learn at different speeds, so they are first dealt out to the targets such that these
-    costs are least in sum. Strategy i is the skill that serves target i.
+    With `steadiness_weight` the difference between the halves of an episode, relative to the
+    whole, is added. Skills learn at different speeds, so they are first dealt out to the targets
+    such that these costs are least in sum. Strategy i is the skill that serves target i.
 
     `strategy_order` then renumbers them, for targets too close to each other to tell which skill
     should be which.
@@ -240,6 +251,10 @@ def choose_demonstrations(
         )
     mean, spread = episodes.mean(axis=-1)[..., None], episodes.std(axis=-1)[..., None]
     cost = np.abs(mean / targets - 1.0) + spread / np.abs(targets)  # [snapshot, skill, target]
+    if steadiness_weight:
+        halves = np.stack([_halves(s.trajectories) for s in snapshots])
+        unsteady = np.abs(halves[..., 0] - halves[..., 1]).mean(axis=-1)[..., None]
+        cost = cost + steadiness_weight * unsteady / np.maximum(np.abs(mean), 1e-6)
     cost = np.where(known[:, :, None], cost, np.inf)
     order = min(
         itertools.permutations(range(len(targets))),
@@ -253,6 +268,13 @@ def choose_demonstrations(
         trajectories += unpad(batch._replace(strategy=np.full_like(batch.strategy, strategy)))
         env_steps.append(snapshot.env_steps)
     return trajectories, env_steps
+
+
+def _halves(batch: TrajectoryBatch) -> np.ndarray:
+    """True return of the first and of the second half of the horizon, `[..., 2]`."""
+    rewards = np.asarray(batch.rewards) * np.asarray(batch.mask)
+    middle = rewards.shape[-1] // 2
+    return np.stack([rewards[..., :middle].sum(-1), rewards[..., middle:].sum(-1)], axis=-1)
 
 
 def choose_test_set(

@@ -32,6 +32,17 @@ def test_each_target_gets_the_nearest_snapshot_of_the_skill_that_serves_it_best(
     assert env_steps == [20, 20] and len(chosen) == 4
 
 
+def test_who_runs_and_then_lies_down_is_not_steady():
+    steady, falling = _snapshot(10, (90.0,)), _snapshot(20, (100.0,))
+    falling.trajectories.rewards[..., :2] *= 2.0
+    falling.trajectories.rewards[..., 2:] = 0.0
+    for weight, expected in ((0.0, 20), (1.0, 10)):
+        _, env_steps = demonstrators.choose_demonstrations(
+            [steady, falling], (100.0,), steadiness_weight=weight
+        )
+        assert env_steps == [expected]
+
+
 def test_a_skill_that_is_not_known_yet_does_not_demonstrate():
     snapshots = [_snapshot(10, (100, 10), accuracy=0.5), _snapshot(20, (130, 13))]
     _, env_steps = demonstrators.choose_demonstrations(snapshots, (100.0, 10.0), 0.9)
