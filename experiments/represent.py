@@ -15,6 +15,7 @@ from represent_jax import config as configs
 from represent_jax.data.catalogue import load_demonstrations
 from represent_jax.envs import make_env
 from represent_jax.methods.config import MethodConfig, make_problem
+from represent_jax.methods.plan import execute
 from represent_jax.methods.presets import make_config
 from represent_jax.methods.registry import METHODS, find_method
 from represent_jax.report import html, tables
@@ -35,7 +36,7 @@ _OUT = flags.DEFINE_string(
 )
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting as dotted.key=value; repeatable.")
 _RESUME = flags.DEFINE_bool("resume", False, "Go on with the run in the folder.")
-_UNTIL = flags.DEFINE_string("until", "evaluation", "Last of the method's stages to run.")
+_UNTIL = flags.DEFINE_string("until", "", "Last of the method's stages to run; all if empty.")
 _CHECKPOINT_SECONDS = flags.DEFINE_float(
     "checkpoint_seconds", 60.0, "Least time between two checkpoints of a stage."
 )
@@ -70,8 +71,8 @@ def _run(config: MethodConfig, out: str) -> None:
     if problem.demonstrations.num_strategies == 1 and config.method == "represent":
         print("one strategy alone: the rewards are learned, but nothing is decomposed")
     with open_run(out, config, resume=_RESUME.value) as run:
-        method = find_method(config.method)
-        results = method.run(config, problem, run, _CHECKPOINT_SECONDS.value, _UNTIL.value)
+        stages = find_method(config.method).plan(config, problem, _CHECKPOINT_SECONDS.value)
+        results = execute(config, problem, stages, run, _UNTIL.value)
         if results is None:
             print(f"{out}: done until {_UNTIL.value}; --resume goes on")
             return

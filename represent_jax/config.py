@@ -84,6 +84,11 @@ def apply_overrides(config: C, overrides: Sequence[str]) -> C:
     return from_dict(type(config), values)
 
 
+def to_plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns a mapping that may hold configurations as nested dictionaries that JSON can hold."""
+    return _plain(values)
+
+
 def config_hash(config: Any) -> str:
     """Returns twelve hexadecimal digits, equal for equal configurations (or dictionaries)."""
     values = dict(config) if isinstance(config, Mapping) else to_dict(config)
@@ -106,6 +111,8 @@ def diff(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         return to_dict(value)
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (tuple, list)):
         return [_plain(item) for item in value]
     return value

@@ -2,24 +2,22 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from represent_jax.agents import rollout as rollouts
+from represent_jax.data.trajectories import pad
 from represent_jax.envs import Environment, Episode
-from represent_jax.errors import RepresentError, unknown
+from represent_jax.errors import RepresentError
 from represent_jax.methods import pipeline, results
-from represent_jax.methods.clock import Clock
 from represent_jax.methods.config import MethodConfig, OneGroupConfig, Problem
+from represent_jax.methods.plan import Stage
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import bc, bc_rnn
 from represent_jax.stages.bc import BcConfig
 from represent_jax.stages.bc_rnn import BcRnnConfig
-from represent_jax.types import Transition
-
-STAGES = ("training", "evaluation")
+from represent_jax.types import Params, Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,18 +44,14 @@ class BcRnnMethodConfig(OneGroupConfig):
     bc_rnn: BcRnnConfig = BcRnnConfig()
 
 
-def run_bc(
-    config: BcMethodConfig,
-    problem: Problem,
-    directory: RunDirectory,
-    checkpoint_seconds: float = 60.0,
-    until: str = STAGES[-1],
-) -> dict[str, Any] | None:
-    """Runs every stage that is not done yet; as `represent.run`."""
+def plan_bc(
+    config: BcMethodConfig, problem: Problem, checkpoint_seconds: float = 60.0
+) -> tuple[Stage, ...]:
+    """The stages of behavioural cloning; see `methods.plan.execute`."""
     env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
 
-    def train(key):
-        return pipeline.run_bc(key, config.bc, problem, directory, checkpoint_seconds)
+    def train(key, directory):
+        return train_bc(key, config.bc, problem, directory, checkpoint_seconds)
 
     def episodes(params, key):
         def policy(params, obs_t, key):
@@ -65,21 +59,20 @@ def run_bc(
 
         return rollouts.rollout(env, policy, params, key, jnp.zeros(results.FINAL_EPISODES))
 
-    return _run(config, problem, directory, until, train, episodes)
+    return (
+        Stage("bc", train, (), {"bc": config.bc}),
+        _evaluation(config, problem, "bc", episodes),
+    )
 
 
-def run_bc_rnn(
-    config: BcRnnMethodConfig,
-    problem: Problem,
-    directory: RunDirectory,
-    checkpoint_seconds: float = 60.0,
-    until: str = STAGES[-1],
-) -> dict[str, Any] | None:
-    """Runs every stage that is not done yet; as `represent.run`."""
+def plan_bc_rnn(
+    config: BcRnnMethodConfig, problem: Problem, checkpoint_seconds: float = 60.0
+) -> tuple[Stage, ...]:
+    """The stages of recurrent behavioural cloning; see `methods.plan.execute`."""
     env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
 
-    def train(key):
-        return pipeline.run_bc_rnn(key, config.bc_rnn, problem, directory, checkpoint_seconds)
+    def train(key, directory):
+        return train_bc_rnn(key, config.bc_rnn, problem, directory, checkpoint_seconds)
 
     def episodes(params, key):
         def policy(params, carry, obs_t, key):
@@ -89,26 +82,67 @@ def run_bc_rnn(
         carry = bc_rnn.initial_carry(results.FINAL_EPISODES, config.bc_rnn)
         return rollouts.rollout_recurrent(env, policy, params, carry, key, levels)
 
-    return _run(config, problem, directory, until, train, episodes)
+    return (
+        Stage("bc_rnn", train, (), {"bc_rnn": config.bc_rnn}),
+        _evaluation(config, problem, "bc_rnn", episodes),
+    )
 
 
-def _run(config, problem, directory, until, train, episodes):
-    if until not in STAGES:
-        raise unknown("stage", until, STAGES)
-    key_train, key_evaluation = jax.random.split(jax.random.PRNGKey(config.seed))
-    clock = Clock(directory)
-    with clock("training"):
-        params = train(key_train)
-    if until == "training":
-        return None
-    with clock("evaluation"):
-        found = results.describe(config, problem)
-        found["rewards"] = {}
+def _evaluation(config, problem, trained_in, episodes) -> Stage:
+    def judge(key, directory, params):
         policies = {config.merged_name: jax.jit(lambda key: episodes(params, key))}
-        found["policies"] = results.judge_policies(
-            key_evaluation, config, problem, policies, {}, directory
+        return {"rewards": {}} | results.judge_policies(
+            key, config, problem, policies, {}, (), directory
         )
-    return clock.finish(found)
+
+    return Stage("policy_evaluation", judge, (trained_in,), reports=True)
+
+
+def train_bc(
+    key: jax.Array,
+    config: bc.BcConfig,
+    problem: Problem,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> Params:
+    """Behavioural cloning of all demonstrations together."""
+    key_split, key = jax.random.split(key)
+    every = pipeline.transitions(problem.demonstrations.trajectories)
+    data = bc.split(key_split, every, config)
+    return pipeline.run_updates(
+        "bc",
+        key,
+        lambda key: bc.init(key, data.train, config),
+        lambda state, data, num_updates: bc.train(state, data, config, num_updates),
+        data,
+        bc.finish,
+        config.num_updates,
+        directory,
+        checkpoint_seconds,
+    )
+
+
+def train_bc_rnn(
+    key: jax.Array,
+    config: bc_rnn.BcRnnConfig,
+    problem: Problem,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> bc_rnn.BcRnnParams:
+    """Recurrent behavioural cloning of all demonstrations together."""
+    data = pad(problem.demonstrations.trajectories, problem.env.horizon)
+    data = jax.tree.map(jnp.asarray, data)
+    return pipeline.run_updates(
+        "bc_rnn",
+        key,
+        lambda key: bc_rnn.init(key, data, config),
+        lambda state, data, num_updates: bc_rnn.train(state, data, config, num_updates),
+        data,
+        bc_rnn.finish,
+        config.num_updates,
+        directory,
+        checkpoint_seconds,
+    )
 
 
 def load_no_rewards(config: MethodConfig, env: Environment, directory: RunDirectory) -> dict:

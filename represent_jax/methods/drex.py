@@ -18,19 +18,17 @@ from represent_jax.agents import rollout as rollouts
 from represent_jax.config import require
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.envs import Environment
-from represent_jax.errors import unknown
-from represent_jax.methods import pipeline, results
-from represent_jax.methods.clock import Clock
+from represent_jax.methods import cloning, pipeline, policy_learning, results
 from represent_jax.methods.config import OneGroupConfig, Problem
+from represent_jax.methods.plan import Stage
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import bc, policies, preference
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.bc import BcConfig
-from represent_jax.stages.noise import NoiseConfig
+from represent_jax.stages.noise import NoiseConfig, NoisyData
 from represent_jax.stages.policies import PoliciesConfig
 from represent_jax.stages.preference import PreferenceConfig
-
-STAGES = ("base", "noise", "preference", "policies", "evaluation")
+from represent_jax.types import Params, RewardFn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,120 +52,92 @@ class DrexConfig(OneGroupConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.base in ("bc", "airl"), "base", "'bc' or 'airl'", self.base)
-
-
-def configure(config: DrexConfig) -> DrexConfig:
-    """Turns a preset's settings into D-REX's: its policies start from random networks."""
-    return dataclasses.replace(config, policies=dataclasses.replace(config.policies, start="cold"))
-
-
-def run(
-    config: DrexConfig,
-    problem: Problem,
-    directory: RunDirectory,
-    checkpoint_seconds: float = 60.0,
-    until: str = STAGES[-1],
-) -> dict[str, Any] | None:
-    """Runs every stage that is not done yet; as `represent.run`."""
-    if until not in STAGES:
-        raise unknown("stage", until, STAGES)
-    if config.base == "bc":
-        # Its policy is of another family than SAC's.
+        # A clone is of another family than SAC's policies.
         require(
-            config.policies.start == "cold", "policies.start", "'cold' with base 'bc'", "phase1"
+            self.base == "airl" or self.policies.start == "cold",
+            "policies.start",
+            "'cold' with base 'bc'",
+            self.policies.start,
         )
-    stage_keys = jax.random.split(jax.random.PRNGKey(config.seed), len(STAGES))
-    keys = dict(zip(STAGES, stage_keys, strict=True))
-    env, clock = problem.env, Clock(directory)
-    starts = None
-    if config.base == "airl":
-        with clock("base"):
-            first = pipeline.run_airl(keys["base"], config, problem, directory, checkpoint_seconds)
-        starts = [jax.tree.map(lambda x: x[0], first.policy)]
-        if until == "base":
-            return None
-        with clock("noise"):
-            noisy = pipeline.run_noise(keys["noise"], config, problem, first, directory)
-    else:
-        with clock("base"):
-            cloned = pipeline.run_bc(
-                keys["base"], config.bc, problem, directory, checkpoint_seconds
-            )
-        if until == "base":
-            return None
 
-        def policy(params, obs_t, key):
-            return bc.act(params, obs_t, key, config.bc, env.action_size)
 
-        def no_reward(_, obs_t, action_t, next_obs_t):
-            return jnp.zeros(obs_t.shape[:-1])
+def configure(settings: dict[str, Any]) -> dict[str, Any]:
+    """Turns a preset's settings of stages into D-REX's: policies start from random networks."""
+    own = settings.get("policies", PoliciesConfig())
+    return settings | {"policies": dataclasses.replace(own, start="cold")}
 
-        stacked = jax.tree.map(lambda x: x[None], cloned)
-        with clock("noise"):
-            noisy = pipeline.run_rollouts(
-                keys["noise"],
-                config.noise,
-                env,
-                policy,
-                stacked,
-                no_reward,
-                jnp.zeros(1),
-                directory,
-            )
-    batch = jax.tree.map(lambda x: x[0], noisy.trajectories)
-    if until == "noise":
-        return None
-    with clock("preference"):
-        params = _run_preference(
-            keys["preference"], config, env, batch, directory, checkpoint_seconds
-        )
-    if until == "preference":
-        return None
 
-    def reward_fn(params, obs_t, action_t, next_obs_t):
-        return preference.reward(params, obs_t, action_t, next_obs_t, config.preference)
+def plan(
+    config: DrexConfig, problem: Problem, checkpoint_seconds: float = 60.0
+) -> tuple[Stage, ...]:
+    """The stages of D-REX; see `methods.plan.execute`."""
+    env, name = problem.env, config.merged_name
+    reward_fn = _reward_fn(config)
 
-    learned = jax.jit(lambda batch: rollouts.learned_returns(batch, reward_fn, params))
-    objective = _objective(config, env, params, batch, reward_fn)
-    with clock("policies"):
-        trained = pipeline.run_policies(
-            keys["policies"],
-            config,
+    def imitate(key, directory):
+        return pipeline.run_airl(key, config, problem, directory, checkpoint_seconds)
+
+    def roll_out(key, directory, first):
+        return pipeline.run_noise(key, config, problem, first, directory)
+
+    def clone(key, directory):
+        return cloning.train_bc(key, config.bc, problem, directory, checkpoint_seconds)
+
+    def roll_out_clone(key, directory, cloned):
+        return _run_noise(key, config, env, cloned, directory)
+
+    def prefer(key, directory, noisy):
+        return _run_preference(key, config, env, _batch(noisy), directory, checkpoint_seconds)
+
+    def judge_rewards(key, directory, noisy, params):
+        batch = _batch(noisy)
+        learned = results.learned_returns(_rewards_of(config, params))
+        found = results.judge_rewards(problem, {"noisy_1": batch}, learned, directory)
+        found[name] |= _accuracies(key, config, params, batch)
+        return {"rewards": found}
+
+    def train(key, directory, base, noisy, params):
+        starts = None
+        if config.policies.start == "phase1":
+            starts = [jax.tree.map(lambda x: x[0], base.policy)]
+        return policy_learning.run(
+            key,
+            config.policies,
+            config.population,
             env,
-            [objective],
+            [_objective(config, env, params, _batch(noisy), reward_fn)],
             reward_fn,
             starts,
             directory,
             checkpoint_seconds,
         )
-    if until == "policies":
-        return None
-    with clock("evaluation"):
-        key_pairs, key_policies = jax.random.split(keys["evaluation"])
-        name = config.merged_name
-        found = results.describe(config, problem)
-        found["rewards"] = results.judge_rewards(
-            problem, {"noisy_1": batch}, {name: learned}, directory
+
+    def judge_policies(key, directory, params, trained):
+        episodes = results.agents_episodes(config.policies, env, (name,), trained)
+        learned = results.learned_returns(_rewards_of(config, params))
+        return results.judge_policies(
+            key, config, problem, episodes, learned, trained.log, directory
         )
-        found["rewards"][name] |= {
-            "ranking_accuracy": float(
-                preference.ranking_accuracy(
-                    batch.noise_level,
-                    rollouts.true_returns(batch),
-                    config.preference.min_level_gap,
-                )
-            ),
-            "pair_accuracy": float(
-                preference.pair_accuracy(params, batch, config.preference, key_pairs, 4096)
-            ),
-        }
-        episodes = results.policy_episodes(
-            config.policies, env, jax.tree.map(lambda x: x[0], trained)
+
+    if config.base == "airl":
+        settings = {"airl": config.airl, "population": config.population}
+        first = (
+            Stage("airl", imitate, (), settings),
+            Stage("noise", roll_out, ("airl",), {"noise": config.noise}),
         )
-        found["policies"] = results.judge_policies(
-            key_policies, config, problem, {name: episodes}, {name: learned}, directory
+    else:
+        first = (
+            Stage("bc", clone, (), {"bc": config.bc}),
+            Stage("noise", roll_out_clone, ("bc",), {"noise": config.noise}),
         )
-    return clock.finish(found)
+    settings = {"policies": config.policies, "population": config.population}
+    return (
+        *first,
+        Stage("preference", prefer, ("noise",), {"preference": config.preference}),
+        Stage("reward_evaluation", judge_rewards, ("noise", "preference"), reports=True),
+        Stage("policies", train, (config.base, "noise", "preference"), settings),
+        Stage("policy_evaluation", judge_policies, ("preference", "policies"), reports=True),
+    )
 
 
 def load_rewards(
@@ -179,14 +149,53 @@ def load_rewards(
         jax.random.PRNGKey(0),
     )
     params = directory.load_output("preference", example.params)
-    return {config.merged_name: lambda *rows: preference.reward(params, *rows, config.preference)}
+    return _rewards_of(config, params)
 
 
 def load_policies(
     config: DrexConfig, env: Environment, directory: RunDirectory
 ) -> dict[str, Callable[[jax.Array], jax.Array]]:
     """The policy of a run, by its only target."""
-    return pipeline.load_agents(config.policies, config.target_names, env, directory)
+    return policy_learning.load(config.policies, config.target_names, env, directory)
+
+
+def _reward_fn(config: DrexConfig) -> RewardFn:
+    def reward_fn(params, obs_t, action_t, next_obs_t):
+        return preference.reward(params, obs_t, action_t, next_obs_t, config.preference)
+
+    return reward_fn
+
+
+def _rewards_of(config: DrexConfig, params: Params) -> dict[str, Callable[..., jax.Array]]:
+    return {config.merged_name: lambda *rows: _reward_fn(config)(params, *rows)}
+
+
+def _batch(noisy: NoisyData) -> TrajectoryBatch:
+    """Rollouts of the only policy."""
+    return jax.tree.map(lambda x: x[0], noisy.trajectories)
+
+
+def _run_noise(key, config, env, cloned: Params, directory) -> NoisyData:
+    def policy(params, obs_t, key):
+        return bc.act(params, obs_t, key, config.bc, env.action_size)
+
+    def no_reward(_, obs_t, action_t, next_obs_t):
+        return jnp.zeros(obs_t.shape[:-1])
+
+    stacked = jax.tree.map(lambda x: x[None], cloned)
+    return pipeline.run_rollouts(
+        key, config.noise, env, policy, stacked, no_reward, jnp.zeros(1), directory
+    )
+
+
+def _accuracies(key, config, params: Params, batch: TrajectoryBatch) -> dict[str, float]:
+    """How often less noise is truly better, and how often the reward says so."""
+    settings = config.preference
+    ranking = preference.ranking_accuracy(
+        batch.noise_level, rollouts.true_returns(batch), settings.min_level_gap
+    )
+    pairs = preference.pair_accuracy(params, batch, settings, key, 4096)
+    return {"ranking_accuracy": float(ranking), "pair_accuracy": float(pairs)}
 
 
 def _run_preference(key, config, env, batch: TrajectoryBatch, directory, checkpoint_seconds):

@@ -6,7 +6,6 @@ to REPRESENT, SSRR and D-REX only.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,16 +13,15 @@ import jax.numpy as jnp
 from represent_jax.agents import rollout as rollouts
 from represent_jax.config import require
 from represent_jax.envs import Environment, Episode
-from represent_jax.errors import unknown
 from represent_jax.methods import pipeline, results
-from represent_jax.methods.clock import Clock
 from represent_jax.methods.config import MethodConfig, Problem, strategy_names
+from represent_jax.methods.plan import Stage
+from represent_jax.methods.population import stack
 from represent_jax.runs import RunDirectory
+from represent_jax.runs.loop import advance
 from represent_jax.stages import msrd
 from represent_jax.stages.msrd import MsrdConfig
 from represent_jax.types import Transition
-
-STAGES = ("msrd", "evaluation")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,62 +45,89 @@ class MsrdMethodConfig(MethodConfig):
         return ("task", *strategy_names(self.num_groups))
 
 
-def run(
-    config: MsrdMethodConfig,
-    problem: Problem,
-    directory: RunDirectory,
-    checkpoint_seconds: float = 60.0,
-    until: str = STAGES[-1],
-) -> dict[str, Any] | None:
-    """Runs every stage that is not done yet; as `represent.run`."""
-    if until not in STAGES:
-        raise unknown("stage", until, STAGES)
-    key_train, key_evaluation = jax.random.split(jax.random.PRNGKey(config.seed))
-    clock = Clock(directory)
-    with clock("msrd"):
-        output = pipeline.run_msrd(key_train, config.msrd, problem, directory, checkpoint_seconds)
-    if until == "msrd":
-        return None
-    with clock("evaluation"):
-        env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
+def plan(
+    config: MsrdMethodConfig, problem: Problem, checkpoint_seconds: float = 60.0
+) -> tuple[Stage, ...]:
+    """The stages of MSRD; see `methods.plan.execute`."""
+    env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
 
+    def learn(key, directory):
+        return train(key, config.msrd, problem, directory, checkpoint_seconds)
+
+    def judge_rewards(key, directory, output):
+        learned = results.learned_returns(_rewards_of(config, output))
+        return {"rewards": results.judge_rewards(problem, {}, learned, directory)}
+
+    def judge_policies(key, directory, output):
         def policy(params, obs_t, key):
             return msrd.act(params, obs_t, key, config.msrd, env.action_size, deterministic=True)
-
-        def learned_by(strategy):
-            def reward_fn(rewards, *transition):
-                return msrd.reward(rewards, *transition, config.msrd, strategy)
-
-            return jax.jit(lambda batch: rollouts.learned_returns(batch, reward_fn, output.rewards))
 
         def episodes_of(strategy):
             params = jax.tree.map(lambda x: x[strategy], output.policies)
             levels = jnp.zeros(results.FINAL_EPISODES)
             return jax.jit(lambda key: rollouts.rollout(env, policy, params, key, levels))
 
-        learned = {
-            name: learned_by(i - 1 if i else None) for i, name in enumerate(config.target_names)
-        }
         episodes = {name: episodes_of(i) for i, name in enumerate(config.group_names)}
-        found = results.describe(config, problem)
-        found["rewards"] = results.judge_rewards(problem, {}, learned, directory)
-        found["policies"] = results.judge_policies(
-            key_evaluation, config, problem, episodes, learned, directory
-        )
-    return clock.finish(found)
+        learned = results.learned_returns(_rewards_of(config, output))
+        return results.judge_policies(key, config, problem, episodes, learned, (), directory)
+
+    return (
+        Stage("msrd", learn, (), {"msrd": config.msrd}),
+        Stage("reward_evaluation", judge_rewards, ("msrd",), reports=True),
+        Stage("policy_evaluation", judge_policies, ("msrd",), reports=True),
+    )
+
+
+def train(
+    key: jax.Array,
+    config: MsrdConfig,
+    problem: Problem,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> msrd.MsrdOutput:
+    """MSRD's joint training of all strategies."""
+    demonstrations = stack(pipeline.transitions_of(problem.demonstrations))
+
+    def init(key):
+        return msrd.init(key, problem.env, demonstrations, config)
+
+    if directory.is_done("msrd"):
+        return directory.load_output("msrd", msrd.finish(jax.eval_shape(init, key)))
+    per_step = config.sac.env_steps_per_step
+    chunk_env_steps = pipeline.chunk_of(config.env_steps, per_step)
+    num_steps = chunk_env_steps // per_step
+    state = advance(
+        directory,
+        "msrd",
+        jax.jit(init)(key),
+        jax.jit(
+            lambda state: msrd.train(state, problem.env, demonstrations, config, num_steps),
+            donate_argnums=0,
+        ),
+        -(-config.env_steps // chunk_env_steps),
+        units_per_chunk=chunk_env_steps,
+        checkpoint_seconds=checkpoint_seconds,
+        describe=lambda m: "discriminator " + pipeline.numbers(m["discriminator_loss"]),
+    )
+    output = msrd.finish(state)
+    directory.save_output("msrd", output)
+    return output
 
 
 def load_rewards(
     config: MsrdMethodConfig, env: Environment, directory: RunDirectory
 ) -> dict[str, Callable[..., jax.Array]]:
     """R^0 and every R^i of a run, by target."""
-    rewards = _load(config, env, directory).rewards
+    return _rewards_of(config, _load(config, env, directory))
 
+
+def _rewards_of(
+    config: MsrdMethodConfig, output: msrd.MsrdOutput
+) -> dict[str, Callable[..., jax.Array]]:
     def reward_of(strategy):
-        return lambda *rows: msrd.reward(rewards, *rows, config.msrd, strategy)
+        return lambda *rows: msrd.reward(output.rewards, *rows, config.msrd, strategy)
 
-    names = config.target_names
-    return {name: reward_of(i - 1 if i else None) for i, name in enumerate(names)}
+    return {name: reward_of(i - 1 if i else None) for i, name in enumerate(config.target_names)}
 
 
 def load_policies(

@@ -4,22 +4,21 @@ A stage itself (`represent_jax.stages`) knows of none of these. Methods call the
 the order that makes the method.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from represent_jax.agents.sac import PolicyParams
 from represent_jax.data.trajectories import Demonstrations, Trajectory, TrajectoryBatch, pad
-from represent_jax.envs import Environment, Episode
+from represent_jax.envs import Episode
 from represent_jax.errors import RepresentError
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.population import Population, stack
 from represent_jax.runs import RunDirectory
 from represent_jax.runs.loop import advance
-from represent_jax.stages import airl, bc, bc_rnn, curve, msrd, noise, policies, regression
+from represent_jax.stages import airl, curve, noise, regression
 from represent_jax.types import Metrics, Params, PolicyFn, RewardFn, Transition
 
 # --- Phase 1 ---
@@ -41,10 +40,10 @@ def run_airl(
 
     if directory.is_done("airl"):
         example = airl.finish(jax.eval_shape(init, key, members[0]))
-        example = jax.tree.map(lambda x: _shape_like(x, len(members)), example)
+        example = jax.tree.map(lambda x: shape_like(x, len(members)), example)
         return directory.load_output("airl", example)
     per_step = airl.generator(config.airl)[1].env_steps_per_step
-    chunk_env_steps = _chunk(config.airl.env_steps, per_step)
+    chunk_env_steps = chunk_of(config.airl.env_steps, per_step)
     step = population.stepper(
         lambda state, demonstrations: airl.train(
             state, problem.env, demonstrations, config.airl, chunk_env_steps // per_step
@@ -58,7 +57,7 @@ def run_airl(
         -(-config.airl.env_steps // chunk_env_steps),
         units_per_chunk=chunk_env_steps,
         checkpoint_seconds=checkpoint_seconds,
-        describe=lambda m: "discriminator " + _numbers(m["discriminator_loss"]),
+        describe=lambda m: "discriminator " + numbers(m["discriminator_loss"]),
     )
     output = stack([airl.finish(state) for state in population.members(states)])
     directory.save_output("airl", output)
@@ -68,7 +67,7 @@ def run_airl(
 def transitions_of(demonstrations: Demonstrations) -> list[Transition]:
     """Transitions of each strategy, repeated to one common number, `[num_transitions]`."""
     gathered = [
-        _transitions(demonstrations.of_strategy(i)) for i in range(demonstrations.num_strategies)
+        transitions(demonstrations.of_strategy(i)) for i in range(demonstrations.num_strategies)
     ]
     longest = max(len(rows.reward_t) for rows in gathered)
     return [
@@ -77,7 +76,8 @@ def transitions_of(demonstrations: Demonstrations) -> list[Transition]:
     ]
 
 
-def _transitions(trajectories: tuple[Trajectory, ...]) -> Transition:
+def transitions(trajectories: tuple[Trajectory, ...]) -> Transition:
+    """Transitions of trajectories one after the other, without the true reward."""
     discount = [np.ones(t.length, np.float32) for t in trajectories]
     for rows, t in zip(discount, trajectories, strict=True):
         rows[-1] = 0.0 if t.terminated else 1.0
@@ -87,7 +87,6 @@ def _transitions(trajectories: tuple[Trajectory, ...]) -> Transition:
         obs_t=np.concatenate([t.obs[:-1] for t in trajectories]),
         action_t=np.concatenate([t.actions for t in trajectories]),
         next_obs_t=np.concatenate([t.obs[1:] for t in trajectories]),
-        # The true reward stays out: nothing before the evaluation may see it.
         reward_t=nothing,
         discount_t=discount_t,
         noise_level_t=nothing,
@@ -175,12 +174,10 @@ def run_regression(
     """Phase 3: all rewards at once."""
     num_strategies = problem.demonstrations.num_strategies
     sizes = (problem.env.observation_size, problem.env.action_size, num_strategies)
+    data = _regression_data(config, problem, noisy, curves)
 
     def init(key):
         return regression.init(key, *sizes, config.regression)
-
-    targets = jnp.repeat(curves.fitted, config.noise.trajectories_per_level, axis=1)
-    data = regression.RegressionData(noisy.trajectories, targets, padded_demonstrations(problem))
 
     def train(state, data, num_updates):
         return regression.train(state, data, config.regression, num_updates)
@@ -195,8 +192,57 @@ def run_regression(
         config.regression.num_updates,
         directory,
         checkpoint_seconds,
-        describe=lambda m: "loss " + _numbers(m["ssrr_loss"]),
+        describe=lambda m: "loss " + numbers(m["ssrr_loss"]),
     )
+
+
+def run_regressions(
+    key: jax.Array,
+    config: RepresentConfig,
+    problem: Problem,
+    noisy: noise.NoisyData,
+    curves: curve.Curve,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> regression.Rewards:
+    """A single reward of every strategy by itself; leaves are `[num_strategies, ...]`."""
+    data = _regression_data(config, problem, noisy, curves)
+    num_strategies = data.targets.shape[0]
+    members = [jax.tree.map(lambda x, i=i: x[i, None], data) for i in range(num_strategies)]
+    sizes = (problem.env.observation_size, problem.env.action_size, 1)
+
+    def init(key, _):
+        return regression.init(key, *sizes, config.regression)
+
+    if directory.is_done("regression"):
+        example = jax.eval_shape(init, key, members[0]).rewards
+        example = jax.tree.map(lambda x: shape_like(x, num_strategies), example)
+        return directory.load_output("regression", example)
+    population = Population(members, config.population)
+    per_chunk = max(1, config.regression.num_updates // 20)
+    states = advance(
+        directory,
+        "regression",
+        population.init(init, key),
+        population.stepper(
+            lambda state, data: regression.train(state, data, config.regression, per_chunk)
+        ),
+        -(-config.regression.num_updates // per_chunk),
+        units_per_chunk=per_chunk,
+        unit="updates",
+        checkpoint_seconds=checkpoint_seconds,
+        describe=lambda m: "loss " + numbers(m["ssrr_loss"]),
+    )
+    output = stack([state.rewards for state in population.members(states)])
+    directory.save_output("regression", output)
+    return output
+
+
+def _regression_data(
+    config: RepresentConfig, problem: Problem, noisy: noise.NoisyData, curves: curve.Curve
+) -> regression.RegressionData:
+    targets = jnp.repeat(curves.fitted, config.noise.trajectories_per_level, axis=1)
+    return regression.RegressionData(noisy.trajectories, targets, padded_demonstrations(problem))
 
 
 def run_updates(
@@ -256,229 +302,16 @@ def padded_demonstrations(problem: Problem) -> TrajectoryBatch:
     return stack(padded)
 
 
-# --- Baselines ---
-
-
-def run_bc(
-    key: jax.Array,
-    config: bc.BcConfig,
-    problem: Problem,
-    directory: RunDirectory,
-    checkpoint_seconds: float,
-) -> Params:
-    """Behavioural cloning of all demonstrations together."""
-    key_split, key = jax.random.split(key)
-    every = _transitions(problem.demonstrations.trajectories)
-    data = bc.split(key_split, every, config)
-    return run_updates(
-        "bc",
-        key,
-        lambda key: bc.init(key, data.train, config),
-        lambda state, data, num_updates: bc.train(state, data, config, num_updates),
-        data,
-        bc.finish,
-        config.num_updates,
-        directory,
-        checkpoint_seconds,
-    )
-
-
-def run_bc_rnn(
-    key: jax.Array,
-    config: bc_rnn.BcRnnConfig,
-    problem: Problem,
-    directory: RunDirectory,
-    checkpoint_seconds: float,
-) -> bc_rnn.BcRnnParams:
-    """Recurrent behavioural cloning of all demonstrations together."""
-    data = pad(problem.demonstrations.trajectories, problem.env.horizon)
-    data = jax.tree.map(jnp.asarray, data)
-    return run_updates(
-        "bc_rnn",
-        key,
-        lambda key: bc_rnn.init(key, data, config),
-        lambda state, data, num_updates: bc_rnn.train(state, data, config, num_updates),
-        data,
-        bc_rnn.finish,
-        config.num_updates,
-        directory,
-        checkpoint_seconds,
-    )
-
-
-def run_msrd(
-    key: jax.Array,
-    config: msrd.MsrdConfig,
-    problem: Problem,
-    directory: RunDirectory,
-    checkpoint_seconds: float,
-) -> msrd.MsrdOutput:
-    """MSRD's joint training of all strategies."""
-    demonstrations = stack(transitions_of(problem.demonstrations))
-
-    def init(key):
-        return msrd.init(key, problem.env, demonstrations, config)
-
-    if directory.is_done("msrd"):
-        return directory.load_output("msrd", msrd.finish(jax.eval_shape(init, key)))
-    per_step = config.sac.env_steps_per_step
-    chunk_env_steps = _chunk(config.env_steps, per_step)
-    num_steps = chunk_env_steps // per_step
-    state = advance(
-        directory,
-        "msrd",
-        jax.jit(init)(key),
-        jax.jit(
-            lambda state: msrd.train(state, problem.env, demonstrations, config, num_steps),
-            donate_argnums=0,
-        ),
-        -(-config.env_steps // chunk_env_steps),
-        units_per_chunk=chunk_env_steps,
-        checkpoint_seconds=checkpoint_seconds,
-        describe=lambda m: "discriminator " + _numbers(m["discriminator_loss"]),
-    )
-    output = msrd.finish(state)
-    directory.save_output("msrd", output)
-    return output
-
-
-# --- Policies ---
-
-
-def objectives_of(
-    config: RepresentConfig, env: Episode, rewards: regression.Rewards
-) -> list[policies.Objective]:
-    """The objectives of a run's targets, in their order: R^0, and every R^i that there is."""
-    scale = env.horizon / config.regression.return_scale
-    return [
-        policies.make_objective(
-            regression.view(rewards, strategy, config.regression), scale, env, config.policies
-        )
-        for strategy in (None, *range(len(config.target_names) - 1))
-    ]
-
-
-def reward_fn_of(config: RepresentConfig) -> RewardFn:
-    """R^0 or R^i as a function of its `regression.View`."""
-
-    def reward_fn(view, obs_t, action_t, next_obs_t):
-        return regression.view_reward(view, obs_t, action_t, next_obs_t, config.regression)
-
-    return reward_fn
-
-
-def run_policies(
-    key: jax.Array,
-    config: RepresentConfig,
-    env: Episode,
-    objectives: Sequence[policies.Objective],
-    reward_fn: RewardFn,
-    starts: Sequence[PolicyParams] | None,
-    directory: RunDirectory,
-    checkpoint_seconds: float,
-) -> PolicyParams:
-    """Policies on learned rewards; leaves of the result are `[num_objectives, ...]`.
-
-    Args:
-      key: PRNG key.
-      config: settings.
-      env: episodes to learn in.
-      objectives: what to maximise. The first is the task's: it starts from the policy of highest
-        learned task return; the others start from `starts` in order.
-      reward_fn: the reward whose parameters the objectives hold.
-      starts: Phase 1's policies; None where there are none, for a cold start.
-      directory: where the stage is saved, and restored from.
-      checkpoint_seconds: least time between two checkpoints.
-    """
-    settings = config.policies
-    key_start, key = jax.random.split(key)
-    if starts is None:
-        starts = [_random_policy(key_start, env, settings)] * len(objectives)
-
-    def init(key, member):
-        return policies.init(key, env, *member, settings, reward_fn)
-
-    if directory.is_done("policies"):
-        state = jax.eval_shape(init, key, (objectives[0], starts[0]))
-        example = policies.finish(state, settings)
-        return directory.load_output(
-            "policies", jax.tree.map(lambda x: _shape_like(x, len(objectives)), example)
-        )
-    best = _best_start(key_start, env, objectives[0], starts, settings, reward_fn)
-    members = list(zip(objectives, [best, *starts[: len(objectives) - 1]], strict=True))
-    population = Population(
-        members, config.population, lambda state: policies.population_axes(state, settings)
-    )
-    step = population.stepper(
-        lambda state, member: policies.train(state, env, member[0], settings, reward_fn)
-    )
-    per_step = policies.agent_of(settings)[1].env_steps_per_step
-    chunk_env_steps = max(1, settings.eval_env_steps // per_step) * per_step
-    states = advance(
-        directory,
-        "policies",
-        population.init(init, key),
-        step,
-        -(-settings.env_steps // chunk_env_steps),
-        units_per_chunk=chunk_env_steps,
-        checkpoint_seconds=checkpoint_seconds,
-        describe=lambda m: "learned return " + _numbers(m["learned_return"]),
-    )
-    output = stack([policies.finish(state, settings) for state in population.members(states)])
-    directory.save_output("policies", output)
-    return output
-
-
-def load_agents(
-    config: policies.PoliciesConfig,
-    names: Sequence[str],
-    env: Environment,
-    directory: RunDirectory,
-) -> dict[str, Callable[[jax.Array], jax.Array]]:
-    """What `run_policies` saved, as deterministic functions of observations, by name."""
-    agent, settings = policies.agent_of(config)
-    key, action_dim = jax.random.PRNGKey(0), env.action_size
-    example = jax.eval_shape(lambda key: _random_policy(key, env, config), key)
-    stacked = directory.load_output(
-        "policies", jax.tree.map(lambda x: _shape_like(x, len(names)), example)
-    )
-
-    def policy_of(i):
-        params = jax.tree.map(lambda x: x[i], stacked)
-        # The key is not used: actions are modes.
-        return lambda obs: agent.act(params, obs, key, settings, action_dim, deterministic=True)
-
-    return {name: policy_of(i) for i, name in enumerate(names)}
-
-
-def _random_policy(key: jax.Array, env: Episode, config: policies.PoliciesConfig) -> PolicyParams:
-    agent, settings = policies.agent_of(config)
-    return agent.policy_of(agent.init_learner(key, env.observation_size, env.action_size, settings))
-
-
-def _best_start(
-    key: jax.Array,
-    env: Episode,
-    task: policies.Objective,
-    starts: Sequence[PolicyParams],
-    config: policies.PoliciesConfig,
-    reward_fn: RewardFn,
-) -> PolicyParams:
-    """The Phase 1 policy with the highest learned task return."""
-    score = jax.jit(
-        lambda policy: policies.evaluate(key, env, task, policy, config, reward_fn).learned_return
-    )
-    return starts[int(np.argmax([float(score(policy)) for policy in starts]))]
-
-
-def _chunk(env_steps: int, per_step: int) -> int:
+def chunk_of(env_steps: int, per_step: int) -> int:
     """Environment steps between two host round trips: a twentieth of the budget."""
     return max(1, env_steps // 20 // per_step) * per_step
 
 
-def _shape_like(leaf: Any, num_members: int) -> jax.ShapeDtypeStruct:
+def shape_like(leaf: Any, num_members: int) -> jax.ShapeDtypeStruct:
+    """Shape and type of a leaf of a population."""
     return jax.ShapeDtypeStruct((num_members, *leaf.shape), leaf.dtype)
 
 
-def _numbers(values: Any) -> str:
+def numbers(values: Any) -> str:
+    """One number, or one of each member, for a progress bar."""
     return " ".join(f"{float(value):.3g}" for value in np.atleast_1d(values))

@@ -93,4 +93,4 @@ def make_config(preset: str, env: str, method: str = "represent") -> MethodConfi
     found = find_method(method)
     has = {field.name for field in dataclasses.fields(found.config)}
     settings = {name: value for name, value in PRESETS[preset].items() if name in has}
-    return found.configure(found.config(env=env, preset=preset, **settings))
+    return found.config(env=env, preset=preset, **found.configure(settings))

@@ -1,19 +1,20 @@
 """Methods by name."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
 from represent_jax.errors import unknown
 from represent_jax.methods import cloning, drex, msrd, represent, ssrr
 from represent_jax.methods.config import MethodConfig, RepresentConfig
+from represent_jax.methods.plan import Stage
 
 Loader = Callable[..., dict[str, Callable[..., jax.Array]]]
 
 
-def _unchanged(config: MethodConfig) -> MethodConfig:
-    return config
+def _unchanged(settings: dict[str, Any]) -> dict[str, Any]:
+    return settings
 
 
 class Method(NamedTuple):
@@ -21,58 +22,55 @@ class Method(NamedTuple):
 
     Attributes:
       config: class of its settings.
-      run: runs its stages, `run(config, problem, directory, checkpoint_seconds, until)`.
-      stages: their names, in order.
+      plan: its stages, `plan(config, problem, checkpoint_seconds)`, for `methods.plan`.
       load_rewards, load_policies: from settings, environment and run directory to functions
         `reward(obs_t, action_t, next_obs_t)` and `policy(obs)`, by target.
-      configure: turns a preset's settings into those of the method.
+      configure: turns a preset's settings of stages into those of the method.
     """
 
     config: type[MethodConfig]
-    run: Callable
-    stages: tuple[str, ...]
+    plan: Callable[..., tuple[Stage, ...]]
     load_rewards: Loader
     load_policies: Loader
-    configure: Callable[[MethodConfig], MethodConfig] = _unchanged
+    configure: Callable[[dict[str, Any]], dict[str, Any]] = _unchanged
 
-
-_REPRESENT = Method(
-    config=RepresentConfig,
-    run=represent.run,
-    stages=represent.STAGES,
-    load_rewards=represent.load_rewards,
-    load_policies=represent.load_policies,
-)
 
 METHODS: dict[str, Method] = {
-    "represent": _REPRESENT,
-    "ssrr": _REPRESENT._replace(configure=ssrr.configure),
+    "represent": Method(
+        config=RepresentConfig,
+        plan=represent.plan,
+        load_rewards=represent.load_rewards,
+        load_policies=represent.load_policies,
+    ),
+    "ssrr": Method(
+        config=ssrr.SsrrConfig,
+        plan=ssrr.plan,
+        load_rewards=ssrr.load_rewards,
+        load_policies=ssrr.load_policies,
+        configure=ssrr.configure,
+    ),
     "drex": Method(
         config=drex.DrexConfig,
-        run=drex.run,
-        stages=drex.STAGES,
+        plan=drex.plan,
         load_rewards=drex.load_rewards,
         load_policies=drex.load_policies,
         configure=drex.configure,
     ),
     "msrd": Method(
         config=msrd.MsrdMethodConfig,
-        run=msrd.run,
-        stages=msrd.STAGES,
+        plan=msrd.plan,
         load_rewards=msrd.load_rewards,
         load_policies=msrd.load_policies,
     ),
     "bc": Method(
         config=cloning.BcMethodConfig,
-        run=cloning.run_bc,
-        stages=cloning.STAGES,
+        plan=cloning.plan_bc,
         load_rewards=cloning.load_no_rewards,
         load_policies=cloning.load_bc_policies,
     ),
     "bc_rnn": Method(
         config=cloning.BcRnnMethodConfig,
-        run=cloning.run_bc_rnn,
-        stages=cloning.STAGES,
+        plan=cloning.plan_bc_rnn,
         load_rewards=cloning.load_no_rewards,
         load_policies=cloning.load_no_recurrent_policies,
     ),

@@ -1,87 +1,138 @@
-"""REPRESENT (Xue, Chen, Gombolay; RA-L 2025), Algorithm 1: the stages in order, resumable.
+"""REPRESENT (Xue, Chen, Gombolay; RA-L 2025), Algorithm 1, as a plan of stages.
 
-demonstrations -> airl -> noise and curve -> regression -> policies -> evaluation
+demonstrations -> airl -> noise -> curve -> regression -> policies, each judged as it ends
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 
-from represent_jax.envs import Environment
-from represent_jax.errors import unknown
-from represent_jax.methods import pipeline
-from represent_jax.methods import results as found
-from represent_jax.methods.clock import Clock
+from represent_jax.envs import Environment, Episode
+from represent_jax.methods import pipeline, policy_learning, results
 from represent_jax.methods.config import Problem, RepresentConfig
+from represent_jax.methods.plan import Stage
+from represent_jax.methods.policy_learning import Trained
 from represent_jax.runs import RunDirectory
-from represent_jax.stages import regression
+from represent_jax.stages import airl, policies, regression
+from represent_jax.types import RewardFn
 
-STAGES = ("airl", "noise", "regression", "policies", "evaluation")
+
+def plan(
+    config: RepresentConfig, problem: Problem, checkpoint_seconds: float = 60.0
+) -> tuple[Stage, ...]:
+    """The stages of REPRESENT; see `methods.plan.execute`."""
+
+    def regress(key, directory, noisy, curves):
+        return pipeline.run_regression(
+            key, config, problem, noisy, curves, directory, checkpoint_seconds
+        )
+
+    return (
+        *first_stages(config, problem, checkpoint_seconds),
+        Stage("regression", regress, ("noise", "curve"), {"regression": config.regression}),
+        *last_stages(
+            config,
+            problem,
+            checkpoint_seconds,
+            views=lambda rewards: _views(config, rewards),
+            rewards_of=lambda rewards: rewards_of(config, rewards),
+        ),
+    )
 
 
-def run(
+def first_stages(
+    config: RepresentConfig, problem: Problem, checkpoint_seconds: float
+) -> tuple[Stage, ...]:
+    """Phases 1 and 2."""
+
+    def imitate(key, directory):
+        return pipeline.run_airl(key, config, problem, directory, checkpoint_seconds)
+
+    def judge_imitation(key, directory, first):
+        return results.judge_airl(key, config, problem, first)
+
+    def roll_out(key, directory, first):
+        return pipeline.run_noise(key, config, problem, first, directory)
+
+    def fit(key, directory, noisy):
+        return pipeline.fit_curves(config, noisy)
+
+    return (
+        Stage("airl", imitate, (), {"airl": config.airl, "population": config.population}),
+        Stage("airl_evaluation", judge_imitation, ("airl",), reports=True),
+        Stage("noise", roll_out, ("airl",), {"noise": config.noise}),
+        Stage("curve", fit, ("noise",), {"curve": config.curve}),
+    )
+
+
+def last_stages(
     config: RepresentConfig,
     problem: Problem,
-    directory: RunDirectory,
-    checkpoint_seconds: float = 60.0,
-    until: str = STAGES[-1],
-) -> dict[str, Any] | None:
-    """Runs every stage that is not done yet and returns the results.
+    checkpoint_seconds: float,
+    views: Callable[[regression.Rewards], dict[str, regression.View]],
+    rewards_of: Callable[[regression.Rewards], dict[str, Callable[..., jax.Array]]],
+) -> tuple[Stage, ...]:
+    """What follows a regression: its rewards judged, policies on them, and these judged.
 
     Args:
       config: settings.
       problem: environment, demonstrations, test trajectories.
-      directory: where stages are saved as they end, and restored from.
-      checkpoint_seconds: least time between two checkpoints of a stage under way.
-      until: the last of `STAGES` to run; called again, the run goes on behind it.
-
-    Returns:
-      The results, None where the run stopped before its evaluation.
-
-    Raises:
-      UsageError: no stage of that name.
-      RepresentError: a loss diverged, or Phase 1's reward is not finite.
+      checkpoint_seconds: least time between two checkpoints.
+      views: from what the regression returned to its rewards, by target, as parameters.
+      rewards_of: the same as functions `reward(obs_t, action_t, next_obs_t)`.
     """
-    if until not in STAGES:
-        raise unknown("stage", until, STAGES)
-    stage_keys = jax.random.split(jax.random.PRNGKey(config.seed), len(STAGES))
-    keys = dict(zip(STAGES, stage_keys, strict=True))
-    clock = Clock(directory)
-    with clock("airl"):
-        first = pipeline.run_airl(keys["airl"], config, problem, directory, checkpoint_seconds)
-    if until == "airl":
-        return None
-    with clock("noise"):
-        noisy = pipeline.run_noise(keys["noise"], config, problem, first, directory)
-    curves = pipeline.fit_curves(config, noisy)
-    if until == "noise":
-        return None
-    with clock("regression"):
-        rewards = pipeline.run_regression(
-            keys["regression"], config, problem, noisy, curves, directory, checkpoint_seconds
-        )
-    if until == "regression":
-        return None
-    with clock("policies"):
-        starts = [jax.tree.map(lambda x, i=i: x[i], first.policy) for i in range(config.num_groups)]
-        trained = pipeline.run_policies(
-            keys["policies"],
-            config,
+    reward_fn = _reward_fn(config)
+
+    def judge_rewards(key, directory, noisy, curves, rewards):
+        groups = results.noisy_groups(noisy)
+        learned = results.learned_returns(rewards_of(rewards))
+        return {
+            "curve": results.describe_curves(curves),
+            "rewards": results.judge_rewards(problem, groups, learned, directory),
+        }
+
+    def train(key, directory, first, rewards) -> Trained:
+        key_start, key = jax.random.split(key)
+        objectives = _objectives(config, problem.env, views(rewards))
+        starts = _starts(key_start, config, problem.env, objectives, first, reward_fn)
+        return policy_learning.run(
+            key,
+            config.policies,
+            config.population,
             problem.env,
-            pipeline.objectives_of(config, problem.env, rewards),
-            pipeline.reward_fn_of(config),
+            list(objectives.values()),
+            reward_fn,
             starts,
             directory,
             checkpoint_seconds,
         )
-    if until == "policies":
-        return None
-    with clock("evaluation"):
-        results = found.evaluate(
-            keys["evaluation"], config, problem, first, noisy, curves, rewards, trained, directory
+
+    def judge_policies(key, directory, rewards, trained):
+        episodes = results.agents_episodes(
+            config.policies, problem.env, config.target_names, trained
         )
-    return clock.finish(results)
+        learned = results.learned_returns(rewards_of(rewards))
+        return results.judge_policies(
+            key, config, problem, episodes, learned, trained.log, directory
+        )
+
+    settings = {"policies": config.policies, "population": config.population}
+    return (
+        Stage("reward_evaluation", judge_rewards, ("noise", "curve", "regression"), reports=True),
+        Stage("policies", train, ("airl", "regression"), settings),
+        Stage("policy_evaluation", judge_policies, ("regression", "policies"), reports=True),
+    )
+
+
+def rewards_of(
+    config: RepresentConfig, rewards: regression.Rewards
+) -> dict[str, Callable[..., jax.Array]]:
+    """R^0 and every R^i that there is, by target."""
+
+    def reward_of(strategy):
+        return lambda *rows: regression.reward(rewards, *rows, config.regression, strategy)
+
+    return {name: reward_of(i - 1 if i else None) for i, name in enumerate(config.target_names)}
 
 
 def load_rewards(
@@ -92,17 +143,62 @@ def load_rewards(
     example = jax.eval_shape(
         lambda key: regression.init(key, *sizes, config.regression), jax.random.PRNGKey(0)
     )
-    rewards = directory.load_output("regression", example.rewards)
-
-    def reward_of(strategy):
-        return lambda *rows: regression.reward(rewards, *rows, config.regression, strategy)
-
-    names = config.target_names
-    return {name: reward_of(i - 1 if i else None) for i, name in enumerate(names)}
+    return rewards_of(config, directory.load_output("regression", example.rewards))
 
 
 def load_policies(
     config: RepresentConfig, env: Environment, directory: RunDirectory
 ) -> dict[str, Callable[[jax.Array], jax.Array]]:
     """The policies of a run, by target."""
-    return pipeline.load_agents(config.policies, config.target_names, env, directory)
+    return policy_learning.load(config.policies, config.target_names, env, directory)
+
+
+def _views(config: RepresentConfig, rewards: regression.Rewards) -> dict[str, regression.View]:
+    return {
+        name: regression.view(rewards, i - 1 if i else None, config.regression)
+        for i, name in enumerate(config.target_names)
+    }
+
+
+def _reward_fn(config: RepresentConfig) -> RewardFn:
+    """R^0 or R^i as a function of its `regression.View`."""
+
+    def reward_fn(view, obs_t, action_t, next_obs_t):
+        return regression.view_reward(view, obs_t, action_t, next_obs_t, config.regression)
+
+    return reward_fn
+
+
+def _objectives(
+    config: RepresentConfig, env: Episode, views: dict[str, regression.View]
+) -> dict[str, policies.Objective]:
+    scale = env.horizon / config.regression.return_scale
+    return {
+        name: policies.make_objective(view, scale, env, config.policies)
+        for name, view in views.items()
+    }
+
+
+def _starts(
+    key: jax.Array,
+    config: RepresentConfig,
+    env: Episode,
+    objectives: dict[str, policies.Objective],
+    first: airl.AirlOutput,
+    reward_fn: RewardFn,
+) -> Sequence[policies.PolicyParams]:
+    """Phase 1's policy of each strategy; for the task that of the highest learned return."""
+    own = {
+        name: jax.tree.map(lambda x, i=i: x[i], first.policy)
+        for i, name in enumerate(config.group_names)
+    }
+
+    def start_of(name, objective):
+        if name in own:
+            return own[name]
+        candidates = list(own.values())
+        return policy_learning.best_start(
+            key, env, objective, candidates, config.policies, reward_fn
+        )
+
+    return [start_of(name, objective) for name, objective in objectives.items()]

@@ -3,7 +3,7 @@
 This is the only place where the true reward is looked at.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -11,13 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from represent_jax.agents import rollout as rollouts
-from represent_jax.agents.sac import PolicyParams
 from represent_jax.data.trajectories import TrajectoryBatch, pad
 from represent_jax.envs import Episode
-from represent_jax.methods import pipeline
 from represent_jax.methods.config import MethodConfig, Problem, RepresentConfig
+from represent_jax.methods.policy_learning import Trained
 from represent_jax.runs import RunDirectory, provenance
-from represent_jax.stages import airl, curve, evaluation, noise, policies, regression, style
+from represent_jax.stages import airl, curve, evaluation, noise, policies, style
 
 # Episodes behind every return that a run reports.
 FINAL_EPISODES = 10
@@ -56,81 +55,79 @@ def describe(config: MethodConfig, problem: Problem) -> dict[str, Any]:
     }
 
 
-def evaluate(
-    key: jax.Array,
-    config: RepresentConfig,
-    problem: Problem,
-    first: airl.AirlOutput,
-    noisy: noise.NoisyData,
-    curves: curve.Curve,
-    rewards: regression.Rewards,
-    trained: PolicyParams,
-    directory: RunDirectory,
-) -> dict[str, Any]:
-    """Compares rewards and policies with the truth, saves plot data, and returns the results."""
-    num_strategies = problem.demonstrations.num_strategies
-    key_airl, key_policies = jax.random.split(key)
-    results = describe(config, problem)
-    results["airl"] = [
-        {"return": value, "ratio": value / one["return_mean"]}
-        for value, one in zip(
-            _airl_returns(key_airl, config, problem, first), results["demonstrators"], strict=True
-        )
-    ]
-    results["curve"] = [
-        _curve_results(jax.tree.map(lambda x, i=i: x[i], curves)) for i in range(num_strategies)
-    ]
-    objectives = pipeline.objectives_of(config, problem.env, rewards)
-    objectives = dict(zip(config.target_names, objectives, strict=True))
-    reward_fn = pipeline.reward_fn_of(config)
-    noisy_groups = {
-        f"noisy_{i + 1}": jax.tree.map(lambda x, i=i: x[i], noisy.trajectories)
-        for i in range(num_strategies)
-    }
-    learned = {
-        name: jax.jit(
-            lambda batch, objective=objective: rollouts.learned_returns(
-                batch, reward_fn, objective.params
-            )
-        )
-        for name, objective in objectives.items()
-    }
-    results["rewards"] = judge_rewards(problem, noisy_groups, learned, directory)
-    episodes = {
-        name: policy_episodes(
-            config.policies,
-            problem.env,
-            jax.tree.map(lambda x, i=i: x[i], trained),
-        )
-        for i, name in enumerate(config.target_names)
-    }
-    results["policies"] = judge_policies(
-        key_policies, config, problem, episodes, learned, directory
-    )
-    return results
-
-
-def policy_episodes(
-    config: policies.PoliciesConfig, env: Episode, policy: PolicyParams
-) -> Episodes:
-    """Deterministic episodes of a trained agent."""
-    return jax.jit(lambda key: policies.rollout(key, env, policy, FINAL_EPISODES, config))
-
-
-def _airl_returns(
+def judge_airl(
     key: jax.Array, config: RepresentConfig, problem: Problem, first: airl.AirlOutput
-) -> list[float]:
+) -> dict[str, Any]:
+    """True returns of Phase 1's policies, and how well its rewards know the test trajectories."""
     env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
+    test = pad(problem.test, problem.env.horizon)
 
-    def one(key, policy):
+    def one(key, policy, reward):
         def act(params, obs_t, key):
             return airl.act(params, obs_t, key, config.airl, env.action_size)
 
+        def reward_fn(params, *transition):
+            return airl.reward(params, *transition, config.airl)
+
         batch = rollouts.rollout(env, act, policy, key, jnp.zeros(FINAL_EPISODES))
-        return jnp.mean(rollouts.true_returns(batch))
+        learned = rollouts.learned_returns(test, reward_fn, reward)
+        found = evaluation.correlate(rollouts.true_returns(test), learned)
+        return jnp.mean(rollouts.true_returns(batch)), found
 
     keys = jax.random.split(key, problem.demonstrations.num_strategies)
-    return [float(value) for value in jax.jit(jax.vmap(one))(keys, first.policy)]
+    returns, found = jax.jit(jax.vmap(one))(keys, first.policy, first.reward)
+    demonstrated = [one["return_mean"] for one in describe(config, problem)["demonstrators"]]
+    return {
+        "airl": [
+            {
+                "return": float(value),
+                "ratio": float(value) / demonstrated[i],
+                "pearson_test": float(found.pearson[i]),
+                "spearman_test": float(found.spearman[i]),
+            }
+            for i, value in enumerate(returns)
+        ]
+    }
+
+
+def noisy_groups(noisy: noise.NoisyData) -> dict[str, TrajectoryBatch]:
+    """Phase 2's rollouts by strategy, as `judge_rewards` takes them."""
+    return {
+        f"noisy_{i + 1}": jax.tree.map(lambda x, i=i: x[i], noisy.trajectories)
+        for i in range(noisy.levels.shape[0])
+    }
+
+
+def learned_returns(
+    rewards: Mapping[str, Callable[..., jax.Array]],
+) -> dict[str, LearnedReturns]:
+    """From functions of transitions to functions of trajectories, by target."""
+
+    def returns_by(reward):
+        return jax.jit(
+            lambda batch: rollouts.learned_returns(batch, lambda _, *rows: reward(*rows), None)
+        )
+
+    return {name: returns_by(reward) for name, reward in rewards.items()}
+
+
+def agents_episodes(
+    config: policies.PoliciesConfig, env: Episode, names: Sequence[str], trained: Trained
+) -> dict[str, Episodes]:
+    """Deterministic episodes of trained agents, by target."""
+
+    def episodes_of(policy):
+        return jax.jit(lambda key: policies.rollout(key, env, policy, FINAL_EPISODES, config))
+
+    return {name: episodes_of(trained.policy(i)) for i, name in enumerate(names)}
+
+
+def describe_curves(curves: curve.Curve) -> list[dict[str, Any]]:
+    """The noise-performance curve of every strategy, for the report."""
+    num_strategies = curves.r2.shape[0]
+    return [
+        _curve_results(jax.tree.map(lambda x, i=i: x[i], curves)) for i in range(num_strategies)
+    ]
 
 
 def _curve_results(fitted: curve.Curve) -> dict[str, Any]:
@@ -203,6 +200,7 @@ def judge_policies(
     problem: Problem,
     episodes: Mapping[str, Episodes],
     learned: Mapping[str, LearnedReturns],
+    log: Sequence[Mapping[str, Any]],
     directory: RunDirectory,
 ) -> dict[str, Any]:
     """True return, learned return and style of policies; saves their learning curves.
@@ -213,11 +211,14 @@ def judge_policies(
       problem: holds the demonstrators.
       episodes: of the policies, by target.
       learned: the rewards they were trained on, by target; a cloned policy has none.
-      directory: holds the training's log, and where curves go.
+      log: what their training logged at every evaluation; empty where nothing was evaluated.
+      directory: where curves go.
+
+    Returns:
+      What was found, under "policies".
     """
     key_style, key = jax.random.split(key)
     share_of_styles = _style_judge(key_style, problem)
-    log = directory.read_log("policies")
     means = [
         float(np.mean([t.total_reward for t in problem.demonstrations.of_strategy(i)]))
         for i in range(problem.demonstrations.num_strategies)
@@ -250,7 +251,7 @@ def judge_policies(
         }
     if log:
         directory.save_arrays("learning_curves", curves)
-    return results
+    return {"policies": results}
 
 
 def _style_judge(key: jax.Array, problem: Problem) -> Callable[[TrajectoryBatch], jax.Array]:

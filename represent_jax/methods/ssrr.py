@@ -1,18 +1,116 @@
 """SSRR (Chen, Paleja, Gombolay; CoRL 2020, https://arxiv.org/abs/2010.11723) on the same stages.
 
-Noisy-AIRL, noise-performance curve and snippet regression of one demonstrator. It is what
-REPRESENT is with a single reward: no R~^i, so neither Eq. 4 nor Eq. 5. For a task reward the
-demonstrations of all strategies are merged, as in the paper's Tables I and II.
+Noisy-AIRL, noise-performance curve and snippet regression of one demonstrator. For a task reward
+the demonstrations of all strategies are merged, as in the paper's Tables I and II; kept separate,
+every strategy has a reward of its own, and Phases 1 and 2 are those of REPRESENT.
 """
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
-from represent_jax.methods.config import RepresentConfig
+import jax
+import jax.numpy as jnp
+
+from represent_jax.config import require
+from represent_jax.envs import Environment
+from represent_jax.methods import pipeline, policy_learning, represent
+from represent_jax.methods.config import Problem, RepresentConfig
+from represent_jax.methods.plan import Stage
+from represent_jax.runs import RunDirectory
+from represent_jax.stages import regression
+from represent_jax.stages.regression import RegressionConfig
+
+_SINGLE = RegressionConfig(strategy_weight=0.0, lambda_reg=0.0, lambda_bcd=0.0)
 
 
-def configure(config: RepresentConfig) -> RepresentConfig:
-    """Turns a preset's settings into SSRR's on merged demonstrations."""
-    regression = dataclasses.replace(
-        config.regression, strategy_weight=0.0, lambda_reg=0.0, lambda_bcd=0.0
+@dataclasses.dataclass(frozen=True)
+class SsrrConfig(RepresentConfig):
+    """Settings of SSRR: those of REPRESENT without R~^i, so without Eq. 4 and Eq. 5."""
+
+    method: str = "ssrr"
+    grouping: str = "merged"
+    regression: RegressionConfig = _SINGLE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for field in ("strategy_weight", "lambda_reg", "lambda_bcd"):
+            found = getattr(self.regression, field)
+            require(found == 0.0, f"regression.{field}", "0, SSRR decomposes nothing", found)
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        """A reward for every group: "task" of merged demonstrations, or "strategy_1", ..."""
+        return self.group_names if self.grouping == "separate" else (self.merged_name,)
+
+
+def configure(settings: dict[str, Any]) -> dict[str, Any]:
+    """Turns a preset's settings of stages into SSRR's."""
+    own = settings.get("regression", RegressionConfig())
+    own = dataclasses.replace(own, strategy_weight=0.0, lambda_reg=0.0, lambda_bcd=0.0)
+    return settings | {"regression": own}
+
+
+def plan(
+    config: SsrrConfig, problem: Problem, checkpoint_seconds: float = 60.0
+) -> tuple[Stage, ...]:
+    """The stages of SSRR; see `methods.plan.execute`."""
+
+    def regress(key, directory, noisy, curves):
+        return pipeline.run_regressions(
+            key, config, problem, noisy, curves, directory, checkpoint_seconds
+        )
+
+    def views(rewards):
+        return {
+            name: regression.view(one, None, config.regression)
+            for name, one in _by_target(config, rewards).items()
+        }
+
+    settings = {"each": config.regression, "population": config.population}
+    return (
+        *represent.first_stages(config, problem, checkpoint_seconds),
+        Stage("regression", regress, ("noise", "curve"), settings),
+        *represent.last_stages(
+            config,
+            problem,
+            checkpoint_seconds,
+            views=views,
+            rewards_of=lambda rewards: _rewards_of(config, rewards),
+        ),
     )
-    return dataclasses.replace(config, method="ssrr", grouping="merged", regression=regression)
+
+
+def load_rewards(
+    config: SsrrConfig, env: Environment, directory: RunDirectory
+) -> dict[str, Callable[..., jax.Array]]:
+    """Every reward of a run, by target."""
+    sizes = (env.observation_size, env.action_size, 1)
+    keys = jnp.zeros((config.num_groups, 2), jnp.uint32)
+    example = jax.eval_shape(
+        jax.vmap(lambda key: regression.init(key, *sizes, config.regression).rewards), keys
+    )
+    return _rewards_of(config, directory.load_output("regression", example))
+
+
+def load_policies(
+    config: SsrrConfig, env: Environment, directory: RunDirectory
+) -> dict[str, Callable[[jax.Array], jax.Array]]:
+    """The policies of a run, by target."""
+    return policy_learning.load(config.policies, config.target_names, env, directory)
+
+
+def _by_target(config: SsrrConfig, rewards: regression.Rewards) -> dict[str, regression.Rewards]:
+    return {
+        name: jax.tree.map(lambda x, i=i: x[i], rewards)
+        for i, name in enumerate(config.target_names)
+    }
+
+
+def _rewards_of(
+    config: SsrrConfig, rewards: regression.Rewards
+) -> dict[str, Callable[..., jax.Array]]:
+    def reward_of(one):
+        return lambda *rows: regression.reward(one, *rows, config.regression, None)
+
+    return {name: reward_of(one) for name, one in _by_target(config, rewards).items()}

@@ -5,6 +5,7 @@ metrics.jsonl        one line of metrics per logged step
 tensorboard/<stage>  the same for TensorBoard
 checkpoints/<stage>  `output` once the stage is done, `progress/<step>` until then
 arrays/<name>.npz    plot data
+findings/<stage>.json what a stage found
 results.json         what the run found
 figures/ report.html
 """
@@ -142,6 +143,22 @@ class RunDirectory:
         with replacing(self.path / "metrics.jsonl") as temporary:
             temporary.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
+    def has_findings(self, stage: str) -> bool:
+        """Returns whether what the stage found is saved."""
+        return self._findings(stage).is_file()
+
+    def save_findings(self, stage: str, findings: Mapping[str, Any]) -> None:
+        """Writes findings/<stage>.json; arrays as lists, numbers that are not finite as null."""
+        _write_json(self._findings(stage), plain(findings))
+
+    def load_findings(self, stage: str) -> dict[str, Any]:
+        """Returns what a stage found.
+
+        Raises:
+            RepresentError: there are no findings of it, or they are no JSON.
+        """
+        return _read_json(self._findings(stage))
+
     def write_results(self, results: Mapping[str, Any]) -> None:
         """Writes results.json; arrays as lists, and numbers that are not finite as null."""
         _write_json(self.path / "results.json", plain(results))
@@ -166,6 +183,9 @@ class RunDirectory:
             RepresentError: the file is missing or not whole.
         """
         return load_arrays(self._arrays(name))
+
+    def _findings(self, stage: str) -> Path:
+        return self.path / "findings" / f"{stage}.json"
 
     def _arrays(self, name: str) -> Path:
         return self.path / "arrays" / f"{name}.npz"

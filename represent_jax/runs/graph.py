@@ -91,6 +91,22 @@ class Graph:
         """What a node that is done took, restarts counted in."""
         return json.loads(self._mark(node).read_text())["seconds"]
 
+    def seconds_in_all(self, node: Node) -> float:
+        """What a node that is done took together with all that it depends on."""
+        behind: dict[str, Node] = {}
+
+        def gather(one: Node) -> None:
+            behind[one.hash] = one
+            for before in one.inputs:
+                gather(before)
+
+        gather(node)
+        return round(sum(self.seconds(one) for one in behind.values()), 1)
+
+    def is_done(self, node: Node) -> bool:
+        """Returns whether the node has its output."""
+        return self.states.get(node.hash) == DONE
+
     def run(self, report: Callable[["Graph", Node, str], None]) -> None:
         """Runs what is left; a node that fails blocks those behind it and stops no other.
 

@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -163,15 +163,20 @@ def _versions() -> dict[str, str]:
 
 
 def append_results(
-    path: str | os.PathLike, method: str, config_hash: str, results: Mapping[str, Any]
+    path: str | os.PathLike,
+    method: str,
+    config_hash: str,
+    results: Mapping[str, Any],
+    only_new: bool = False,
 ) -> None:
     """Appends every figure of a run's results: demonstrators, rewards and policies.
 
     Args:
-        path: the file.
-        method: name of the method.
-        config_hash: hash of the run's configuration.
-        results: what the method returned.
+      path: the file.
+      method: name of the method.
+      config_hash: hash of the run's configuration.
+      results: what the method returned, or the part of it that there is so far.
+      only_new: leaves out figures that the file holds for the same run already.
     """
     common = {
         "domain": results["env"],
@@ -183,11 +188,25 @@ def append_results(
         "seconds": sum(results["seconds"].values()),
         **provenance(),
     }
-    figures = [(one["name"], "demo_return", one["return_mean"]) for one in results["demonstrators"]]
+    held = set()
+    if only_new:
+        names = ("domain", "method", "seed", "preset", "config_hash")
+        same = read_records(path, **{name: common[name] for name in names})
+        held = {(record["target"], record["quantity"]) for record in same}
+    for target, quantity, value in _figures(results):
+        if (target, quantity) not in held:
+            append_record(path, target=target, quantity=quantity, value=value, **common)
+
+
+def _figures(results: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    """Yields target, quantity and value of every figure in a run's results."""
+    for one in results["demonstrators"]:
+        yield one["name"], "demo_return", one["return_mean"]
     for one, imitation in zip(results["demonstrators"], results.get("airl", ()), strict=False):
-        figures.append((one["name"], "airl_return", imitation["return"]))
+        for name, value in imitation.items():
+            if name != "ratio":
+                yield one["name"], f"airl_{name}", value
     for part in ("rewards", "policies"):
-        for target, quantities in results[part].items():
-            figures += [(target, name, value) for name, value in quantities.items()]
-    for target, quantity, value in figures:
-        append_record(path, target=target, quantity=quantity, value=value, **common)
+        for target, quantities in results.get(part, {}).items():
+            for name, value in quantities.items():
+                yield target, name, value

@@ -64,7 +64,7 @@ class RegressionConfig:
       include_action: whether rewards see state and action as well as the next state.
     """
 
-    num_updates: int = 2000
+    num_updates: int = 3000
     num_snippets: int = 64
     states_per_snippet: int = 16
     num_demonstration_states: int = 256

@@ -1,0 +1,1 @@
+"""Many runs as one: what the paper's tables are made of, run as a graph and read from records."""

@@ -1,0 +1,96 @@
+"""A campaign's runs as nodes of one graph, and what they found as records."""
+
+import dataclasses
+import functools
+import os
+from collections.abc import Iterable, Sequence
+
+from represent_jax import config as configs
+from represent_jax.campaign.variants import VARIANTS, runs_of
+from represent_jax.data.catalogue import load_demonstrations
+from represent_jax.envs import make_env
+from represent_jax.methods.config import MethodConfig, Problem, make_problem
+from represent_jax.methods.plan import nodes
+from represent_jax.methods.registry import find_method
+from represent_jax.methods.results import describe
+from represent_jax.runs.graph import Graph, Node
+from represent_jax.runs.records import append_results
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Entry:
+    """One run of the campaign.
+
+    Attributes:
+      variant: what records call it.
+      config: its settings.
+      problem: what it is given.
+      reports: the nodes whose outputs are recorded, in order.
+    """
+
+    variant: str
+    config: MethodConfig
+    problem: Problem
+    reports: tuple[Node, ...]
+
+
+def entries(
+    tables: Sequence[str],
+    domains: Sequence[str],
+    seeds: Sequence[int],
+    preset: str,
+    overrides: Sequence[str] = (),
+) -> list[Entry]:
+    """The runs behind some tables, seed by seed, so that every seed adds to all of them.
+
+    Raises:
+      UsageError: no table, domain or preset of that name, or a setting that does not fit.
+      RepresentError: demonstrations do not fit their environment.
+    """
+    wanted = runs_of(tables, domains)
+    found = []
+    for seed in seeds:
+        for domain, variants in wanted.items():
+            for variant, reached in variants.items():
+                config = VARIANTS[variant].config(preset, domain, [*overrides, f"seed={seed}"])
+                found.append(_entry(variant, config, reached))
+    return found
+
+
+def _entry(variant: str, config: MethodConfig, reached: Sequence[str]) -> Entry:
+    env = _env(config.env, config.backend)
+    problem = make_problem(
+        config,
+        env,
+        _data(config.demonstrations or config.env),
+        _data(f"{config.env}_test"),
+    )
+    stages = find_method(config.method).plan(config, problem)
+    made = nodes(config, problem, stages, f"{config.env} {variant} seed {config.seed}")
+    last = max(i for i, stage in enumerate(stages) if stage.name in reached)
+    reports = [made[stage.name] for stage in stages[: last + 1] if stage.reports]
+    return Entry(VARIANTS[variant].name, config, problem, tuple(reports))
+
+
+@functools.cache
+def _env(name: str, backend: str):
+    return make_env(name, backend)
+
+
+@functools.cache
+def _data(name: str):
+    return load_demonstrations(name)
+
+
+def record(graph: Graph, every: Iterable[Entry], path: str | os.PathLike) -> None:
+    """Appends to a file what is done and not recorded there yet.
+
+    Called whenever a node ends it loses nothing, and called again it adds nothing.
+    """
+    for entry in every:
+        for node in entry.reports:
+            if graph.is_done(node):
+                results = describe(entry.config, entry.problem) | graph.output(node)
+                results["seconds"] = {node.name: graph.seconds_in_all(node)}
+                config_hash = configs.config_hash(entry.config)
+                append_results(path, entry.variant, config_hash, results, only_new=True)

@@ -1,0 +1,263 @@
+"""The paper's tables from records, beside the paper's own figures."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from represent_jax.campaign import paper
+from represent_jax.campaign.statistics import Aggregate, aggregate
+from represent_jax.campaign.variants import DOMAINS
+from represent_jax.errors import RepresentError, unknown
+from represent_jax.report.tables import Table
+from represent_jax.report.values import display_name, format_number
+
+DOMAIN_NAMES = {
+    "hopper": "Hopper",
+    "half_cheetah": "HalfCheetah",
+    "inverted_double_pendulum": "Double pendulum",
+}
+METHOD_NAMES = {
+    "represent": "REPRESENT",
+    "ssrr": "SSRR",
+    "msrd": "MSRD",
+    "drex": "D-REX",
+    "bc": "BC",
+    "bc_rnn": "BC-RNN",
+    "airl": "Noisy-AIRL",
+    "demonstrators": "Demonstrators",
+    "no_reg": "without L_reg",
+    "no_bcd": "without L_BCD",
+    "shared": "R^0 alone",
+    "ensemble_1": "ensemble of one",
+    "literal_bcd": "Eq. 5 literally",
+    "cold": "cold start",
+    "three_strategies": "REPRESENT",
+}
+_TARGETS = ("task", "strategy_1", "strategy_2")
+_RETURNS = ("return_best", "return_final")
+
+
+class Cell(NamedTuple):
+    """One figure of a table.
+
+    Attributes:
+      domain, target, method, quantity: what was measured.
+      found: over seeds; None where there are no records.
+      paper: mean, and standard deviation where there is one, in the paper; None if not there.
+    """
+
+    domain: str
+    target: str
+    method: str
+    quantity: str
+    found: Aggregate | None
+    paper: tuple[float, ...] | None
+
+
+class Select:
+    """Records of one preset, by what they measured; of several of one run the newest counts."""
+
+    def __init__(self, records: Iterable[Mapping[str, Any]], preset: str):
+        """Sorts the records."""
+        self.preset = preset
+        self._values: dict[tuple[str, str, str, str], dict[int, float]] = {}
+        for record in records:
+            if record["preset"] == preset and record["value"] is not None:
+                where = tuple(record[n] for n in ("domain", "target", "method", "quantity"))
+                self._values.setdefault(where, {})[record["seed"]] = record["value"]
+
+    def values(self, domain: str, target: str, method: str, quantity: str) -> dict[int, float]:
+        """Returns the value of every seed."""
+        return self._values.get((domain, target, method, quantity), {})
+
+    def cell(
+        self,
+        domain: str,
+        target: str,
+        method: str,
+        quantity: str,
+        published: tuple[float, ...] | float | None = None,
+    ) -> Cell:
+        """Aggregates the seeds of one figure."""
+        values = list(self.values(domain, target, method, quantity).values())
+        found = aggregate(values) if values else None
+        if published is not None and not isinstance(published, tuple):
+            published = (published,)
+        return Cell(domain, target, method, quantity, found, published)
+
+
+def correlations(select: Select) -> list[Cell]:
+    """Table I: learned against true return, pooled as in the paper, and on unseen trajectories."""
+    cells = []
+    for domain in DOMAINS:
+        for target in _TARGETS:
+            methods = ["represent", "ssrr", "msrd"] + ["drex"] * (target == "task")
+            for method in methods:
+                published = paper.CORRELATIONS.get((domain, target, method))
+                cells.append(select.cell(domain, target, method, "pearson_pooled", published))
+                cells.append(select.cell(domain, target, method, "pearson_test"))
+            if target != "task":
+                cells.append(select.cell(domain, target, "represent", "airl_pearson_test"))
+                cells[-1] = cells[-1]._replace(method="airl", quantity="pearson_test")
+    return cells
+
+
+def returns(select: Select) -> list[Cell]:
+    """Table II: true return of policies, the highest as in the paper, and of the one kept."""
+    cells = []
+    for domain in DOMAINS:
+        for target in _TARGETS:
+            cells.append(_demonstrated(select, domain, target))
+            merged = ["drex", "bc", "bc_rnn"] if target == "task" else ["msrd"]
+            for method in ["represent", "ssrr", *merged]:
+                published = paper.RETURNS.get((domain, target, method))
+                cells.append(select.cell(domain, target, method, "return_best", published))
+                cells.append(select.cell(domain, target, method, "return_final"))
+            if target != "task":
+                cells.append(select.cell(domain, target, "represent", "airl_return"))
+                cells[-1] = cells[-1]._replace(method="airl", quantity="return_final")
+    return cells
+
+
+def ablations(select: Select) -> list[Cell]:
+    """Table III: policies on Hopper where one of the losses is left out."""
+    return [
+        select.cell("hopper", target, method, quantity, published)
+        for target in _TARGETS
+        for method in ("represent", "no_reg", "no_bcd", "ssrr")
+        for quantity in _RETURNS
+        for published in [
+            paper.ABLATIONS.get((target, method)) if quantity == "return_best" else None
+        ]
+    ]
+
+
+def three_strategies(select: Select) -> list[Cell]:
+    """Table V: three strategies on HalfCheetah."""
+    cells = []
+    for target in ("strategy_1", "strategy_2", "strategy_3", "task"):
+        cells.append(_demonstrated(select, "half_cheetah", target, "three_strategies", 3))
+        published = paper.THREE_STRATEGIES.get((target, "represent"))
+        for quantity, beside in (("return_best", published), ("return_final", None)):
+            cells.append(select.cell("half_cheetah", target, "three_strategies", quantity, beside))
+        cells.append(select.cell("half_cheetah", target, "three_strategies", "pearson_test"))
+    return cells
+
+
+def further_ablations(select: Select) -> list[Cell]:
+    """Where the gain comes from: rewards without parts of the method."""
+    return [
+        select.cell(domain, target, method, quantity)
+        for domain in DOMAINS
+        for target in _TARGETS
+        for method in ("represent", "no_reg", "no_bcd", "shared", "ensemble_1", "literal_bcd")
+        for quantity in ("pearson_pooled", "pearson_test")
+    ]
+
+
+def cold_starts(select: Select) -> list[Cell]:
+    """What starting from Phase 1's policies does."""
+    return [
+        select.cell(domain, target, method, quantity)
+        for domain in DOMAINS
+        for target in _TARGETS
+        for method in ("represent", "cold")
+        for quantity in _RETURNS
+    ]
+
+
+TABLES: dict[str, tuple[str, Callable[[Select], list[Cell]]]] = {
+    "1": ("Table I. Correlation of learned with true return", correlations),
+    "2": ("Table II. True return of policies", returns),
+    "3": ("Table III. Hopper without one of the losses: true return of policies", ablations),
+    "5": ("Table V. Three strategies on HalfCheetah", three_strategies),
+    "ablations": ("Where the gain comes from", further_ablations),
+    "cold": ("Policies from Phase 1's and from random networks: true return", cold_starts),
+}
+
+
+def make(name: str, records: Iterable[Mapping[str, Any]], preset: str) -> tuple[str, list[Cell]]:
+    """The cells of a table for which there are records, and the table's title.
+
+    Raises:
+      UsageError: no table of that name.
+      RepresentError: no record belongs to the table.
+    """
+    if name not in TABLES:
+        raise unknown("table", name, TABLES)
+    title, cells_of = TABLES[name]
+    cells = [cell for cell in cells_of(Select(records, preset)) if cell.found is not None]
+    if not cells:
+        raise RepresentError(f"table {name}: no record of preset {preset!r} belongs to it")
+    return title, cells
+
+
+def to_table(title: str, cells: Sequence[Cell]) -> Table:
+    """The cells as text, a line for each."""
+    rows = []
+    for cell in cells:
+        digits = 3 if cell.quantity.startswith("pearson") else 0
+        found = cell.found
+        published = cell.paper or ()
+        rows.append(
+            (
+                f"{DOMAIN_NAMES[cell.domain]}, {display_name(cell.target).lower()}",
+                METHOD_NAMES[cell.method],
+                _QUANTITY_NAMES[cell.quantity],
+                _plus_minus(found.mean, found.std, digits),
+                format_number(found.iqm, digits),
+                _interval(found.low, found.high, digits),
+                str(found.num),
+                _plus_minus(*published, digits=digits) if published else "-",
+            )
+        )
+    return Table(
+        title=title,
+        columns=(
+            "reward or policy",
+            "method",
+            "quantity",
+            "mean +- std",
+            "IQM",
+            "95 % interval",
+            "seeds",
+            "paper",
+        ),
+        rows=tuple(rows),
+        note="IQM: interquartile mean over seeds, with its bootstrap interval.",
+    )
+
+
+_QUANTITY_NAMES = {
+    "pearson_pooled": "r, pooled",
+    "pearson_test": "r, unseen",
+    "return_best": "highest",
+    "return_final": "kept",
+    "demo_return": "demonstrated",
+}
+
+
+def _demonstrated(
+    select: Select, domain: str, target: str, method: str = "represent", num_strategies: int = 2
+) -> Cell:
+    """True return of a strategy's demonstrators, for the task the mean of all strategies."""
+    names = [f"strategy_{i + 1}" for i in range(num_strategies)] if target == "task" else [target]
+    means = []
+    for name in names:
+        values = list(select.values(domain, name, method, "demo_return").values())
+        means += values[:1]
+    # Demonstrations are the same for all seeds.
+    found = aggregate([sum(means) / len(means)]) if len(means) == len(names) else None
+    given = paper.THREE_STRATEGIES.get((target, "demonstrators"))
+    if num_strategies == 2:
+        given = paper.RETURNS.get((domain, target, "demonstrators"))
+    published = None if given is None else (given,)
+    return Cell(domain, target, "demonstrators", "demo_return", found, published)
+
+
+def _plus_minus(mean: float, std: float = float("nan"), digits: int = 3) -> str:
+    spread = format_number(std, digits)
+    return format_number(mean, digits) + ("" if spread == "-" else f" +- {spread}")
+
+
+def _interval(low: float, high: float, digits: int) -> str:
+    return "-" if low != low else f"{format_number(low, digits)} to {format_number(high, digits)}"

@@ -1,0 +1,115 @@
+"""The runs behind the paper's tables: methods, ablations, and how far each has to go."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from represent_jax import config as configs
+from represent_jax.errors import UsageError, unknown
+from represent_jax.methods.config import MethodConfig
+from represent_jax.methods.presets import make_config
+
+DOMAINS = ("hopper", "half_cheetah", "inverted_double_pendulum")
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """A method with some of its settings changed.
+
+    Attributes:
+      name: what records call it.
+      method: name of the method.
+      overrides: settings as `dotted.key=value`.
+    """
+
+    name: str
+    method: str
+    overrides: tuple[str, ...] = ()
+
+    def config(self, preset: str, domain: str, overrides: Sequence[str] = ()) -> MethodConfig:
+        """The settings of a preset, changed as the variant says and then by `overrides`.
+
+        Overrides of stages that the method does not have are left out.
+        """
+        config = make_config(preset, domain, self.method)
+        own = {field.name for field in dataclasses.fields(config)}
+        general = [one for one in overrides if one.partition("=")[0].partition(".")[0] in own]
+        return configs.apply_overrides(config, [*self.overrides, *general])
+
+
+# SSRR appears twice: the tables' task row is on merged demonstrations, their strategy rows are on
+# each strategy's own. Both are recorded as "ssrr"; their targets differ.
+VARIANTS = {
+    "represent": Variant("represent", "represent"),
+    "ssrr": Variant("ssrr", "ssrr"),
+    "ssrr_separate": Variant("ssrr", "ssrr", ("grouping=separate",)),
+    "msrd": Variant("msrd", "msrd"),
+    "drex": Variant("drex", "drex"),
+    "bc": Variant("bc", "bc"),
+    "bc_rnn": Variant("bc_rnn", "bc_rnn"),
+    "no_reg": Variant("no_reg", "represent", ("regression.lambda_reg=0",)),
+    "no_bcd": Variant("no_bcd", "represent", ("regression.lambda_bcd=0",)),
+    "shared": Variant("shared", "represent", ("regression.strategy_weight=0",)),
+    "ensemble_1": Variant("ensemble_1", "represent", ("regression.ensemble_size=1",)),
+    "literal_bcd": Variant("literal_bcd", "represent", ("regression.discrimination=literal",)),
+    "cold": Variant("cold", "represent", ("policies.start=cold",)),
+    "three_strategies": Variant("three_strategies", "represent", ("num_strategies=3",)),
+}
+
+_REWARDS, _POLICIES = "reward_evaluation", "policy_evaluation"
+_DECOMPOSING = ("represent", "ssrr", "ssrr_separate", "msrd", "drex")
+
+
+@dataclasses.dataclass(frozen=True)
+class TableRuns:
+    """The runs of one table.
+
+    Attributes:
+      domains: of these the table speaks.
+      until: by variant, the last stage that it needs.
+    """
+
+    domains: tuple[str, ...]
+    until: dict[str, str]
+
+
+TABLES = {
+    "1": TableRuns(DOMAINS, dict.fromkeys(_DECOMPOSING, _REWARDS)),
+    "2": TableRuns(DOMAINS, dict.fromkeys((*_DECOMPOSING, "bc", "bc_rnn"), _POLICIES)),
+    "3": TableRuns(
+        ("hopper",),
+        dict.fromkeys(("represent", "no_reg", "no_bcd", "ssrr", "ssrr_separate"), _POLICIES),
+    ),
+    "5": TableRuns(("half_cheetah",), {"three_strategies": _POLICIES}),
+    "ablations": TableRuns(
+        DOMAINS,
+        dict.fromkeys(
+            ("represent", "no_reg", "no_bcd", "shared", "ensemble_1", "literal_bcd"), _REWARDS
+        ),
+    ),
+    "cold": TableRuns(DOMAINS, dict.fromkeys(("represent", "cold"), _POLICIES)),
+}
+
+
+def runs_of(tables: Sequence[str], domains: Sequence[str]) -> dict[str, dict[str, tuple[str, ...]]]:
+    """The runs behind some tables: by domain and variant, the stages that have to be reached.
+
+    Raises:
+      UsageError: no table, or no domain, of that name.
+    """
+    for table in tables:
+        if table not in TABLES:
+            raise unknown("table", table, TABLES)
+    for domain in domains:
+        if domain not in DOMAINS:
+            raise unknown("domain", domain, DOMAINS)
+    wanted: dict[str, dict[str, tuple[str, ...]]] = {}
+    for domain in domains:
+        for table in tables:
+            if domain not in TABLES[table].domains:
+                continue
+            for variant, until in TABLES[table].until.items():
+                reached = wanted.setdefault(domain, {}).setdefault(variant, ())
+                wanted[domain][variant] = tuple(dict.fromkeys((*reached, until)))
+    if not wanted:
+        raise UsageError(f"tables {', '.join(tables)} do not speak of {', '.join(domains)}")
+    return wanted

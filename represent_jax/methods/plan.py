@@ -1,0 +1,140 @@
+"""A method as a plan: its stages in order, what each is given and what its output depends on.
+
+A run executes a plan in one folder; a campaign executes many plans as one graph, in which methods
+share the stages that are the same for both. The key of a stage depends on the seed and the stage's
+name alone, so both ways give the same results.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from represent_jax import config as configs
+from represent_jax.data.trajectories import Trajectory
+from represent_jax.errors import unknown
+from represent_jax.methods.clock import Clock
+from represent_jax.methods.config import MethodConfig, Problem
+from represent_jax.methods.results import describe
+from represent_jax.runs import RunDirectory
+from represent_jax.runs.graph import Node
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """One stage of a method.
+
+    Attributes:
+      name: where a run keeps it, and what its key is drawn for.
+      run: `run(key, directory, *inputs)` makes the output, or loads it where the directory has it.
+      inputs: names of the stages whose outputs it is given, in order.
+      settings: what the output depends on beside the problem, the seed and the inputs.
+      reports: whether the output is a part of the run's results.
+    """
+
+    name: str
+    run: Callable[..., Any]
+    inputs: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    reports: bool = False
+
+
+def stage_key(seed: int, name: str) -> jax.Array:
+    """The key of a stage."""
+    return jax.random.fold_in(jax.random.PRNGKey(seed), zlib.crc32(name.encode()))
+
+
+def run_stage(seed: int, stage: Stage, directory: RunDirectory, *inputs: Any) -> Any:
+    """Runs a stage, or returns what it reported where the directory holds that already."""
+    key = stage_key(seed, stage.name)
+    if not stage.reports:
+        return stage.run(key, directory, *inputs)
+    if not directory.has_findings(stage.name):
+        directory.save_findings(stage.name, stage.run(key, directory, *inputs))
+    return directory.load_findings(stage.name)
+
+
+def execute(
+    config: MethodConfig,
+    problem: Problem,
+    stages: Sequence[Stage],
+    directory: RunDirectory,
+    until: str = "",
+) -> dict[str, Any] | None:
+    """Runs every stage that is not done yet and returns the results.
+
+    Args:
+      config: settings of the method.
+      problem: environment, demonstrations, test trajectories.
+      stages: the method's plan.
+      directory: where stages are saved as they end, and restored from.
+      until: the last stage to run, the plan's last if empty; called again, the run goes on.
+
+    Returns:
+      The results, None where the run stopped before its last stage.
+
+    Raises:
+      UsageError: no stage of that name.
+      RepresentError: a loss diverged, or Phase 1's reward is not finite.
+    """
+    names = [stage.name for stage in stages]
+    if until and until not in names:
+        raise unknown("stage", until, names)
+    clock, outputs = Clock(directory), {}
+    for stage in stages:
+        with clock(stage.name):
+            inputs = (outputs[before] for before in stage.inputs)
+            outputs[stage.name] = run_stage(config.seed, stage, directory, *inputs)
+        if stage.name == until != names[-1]:
+            return None
+    results = describe(config, problem)
+    for stage in stages:
+        if stage.reports:
+            results |= outputs[stage.name]
+    return clock.finish(results)
+
+
+def nodes(
+    config: MethodConfig, problem: Problem, stages: Sequence[Stage], name: str
+) -> dict[str, Node]:
+    """The stages of a plan as nodes of a graph, by the name of the stage.
+
+    Args:
+      config: settings of the method.
+      problem: environment, demonstrations, test trajectories.
+      stages: the method's plan.
+      name: of the run, as people see it.
+    """
+    common = {
+        "env": config.env,
+        "backend": problem.env.backend,
+        "horizon": problem.env.horizon,
+        "seed": config.seed,
+        "demonstrations": _digest(problem.demonstrations.trajectories),
+    }
+    judged = common | {"test": _digest(problem.test)}
+    made: dict[str, Node] = {}
+    for stage in stages:
+        made[stage.name] = Node(
+            kind=f"{config.env} {stage.name}",
+            name=f"{name} {stage.name}",
+            settings={**(judged if stage.reports else common), **configs.to_plain(stage.settings)},
+            inputs=tuple(made[before] for before in stage.inputs),
+            run=functools.partial(run_stage, config.seed, stage),
+        )
+    return made
+
+
+def _digest(trajectories: Sequence[Trajectory]) -> str:
+    """Hash of everything in the trajectories."""
+    digest = hashlib.sha256()
+    for t in trajectories:
+        for array in (t.obs, t.actions, t.rewards):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(f"{t.length} {t.terminated} {t.strategy}".encode())
+    return digest.hexdigest()[:16]

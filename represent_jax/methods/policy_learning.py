@@ -1,0 +1,135 @@
+"""Policies on learned rewards, all targets as one population on a run directory."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from represent_jax.agents.sac import PolicyParams
+from represent_jax.envs import Environment, Episode
+from represent_jax.methods.pipeline import numbers, shape_like
+from represent_jax.methods.population import Population, stack
+from represent_jax.runs import RunDirectory
+from represent_jax.runs.loop import advance
+from represent_jax.stages import policies
+from represent_jax.stages.policies import PoliciesConfig
+from represent_jax.types import RewardFn
+
+
+class Trained(NamedTuple):
+    """Policies and how they came about.
+
+    Attributes:
+      policies: leaves `[num_objectives, ...]`, in the order of the objectives.
+      log: what was logged at every evaluation.
+    """
+
+    policies: PolicyParams
+    log: list[dict[str, Any]]
+
+    def policy(self, i: int) -> PolicyParams:
+        """Returns the policy of objective i."""
+        return jax.tree.map(lambda x: x[i], self.policies)
+
+
+def run(
+    key: jax.Array,
+    config: PoliciesConfig,
+    population: str,
+    env: Episode,
+    objectives: Sequence[policies.Objective],
+    reward_fn: RewardFn,
+    starts: Sequence[PolicyParams] | None,
+    directory: RunDirectory,
+    checkpoint_seconds: float,
+) -> Trained:
+    """Trains a policy on every objective.
+
+    Args:
+      key: PRNG key.
+      config: settings.
+      population: how they run together, see `methods.population`.
+      env: episodes to learn in.
+      objectives: what to maximise.
+      reward_fn: the reward whose parameters the objectives hold.
+      starts: the policy that each begins as; None where there are none, for a cold start.
+      directory: where the stage is saved, and restored from.
+      checkpoint_seconds: least time between two checkpoints.
+    """
+    key_start, key = jax.random.split(key)
+    if starts is None:
+        starts = [_random_policy(key_start, env, config)] * len(objectives)
+    members = list(zip(objectives, starts, strict=True))
+
+    def init(key, member):
+        return policies.init(key, env, *member, config, reward_fn)
+
+    if directory.is_done("policies"):
+        example = policies.finish(jax.eval_shape(init, key, members[0]), config)
+        example = jax.tree.map(lambda x: shape_like(x, len(members)), example)
+        return Trained(directory.load_output("policies", example), directory.read_log("policies"))
+    population = Population(
+        members, population, lambda state: policies.population_axes(state, config)
+    )
+    step = population.stepper(
+        lambda state, member: policies.train(state, env, member[0], config, reward_fn)
+    )
+    per_step = policies.agent_of(config)[1].env_steps_per_step
+    chunk_env_steps = max(1, config.eval_env_steps // per_step) * per_step
+    states = advance(
+        directory,
+        "policies",
+        population.init(init, key),
+        step,
+        -(-config.env_steps // chunk_env_steps),
+        units_per_chunk=chunk_env_steps,
+        checkpoint_seconds=checkpoint_seconds,
+        describe=lambda m: "learned return " + numbers(m["learned_return"]),
+    )
+    output = stack([policies.finish(state, config) for state in population.members(states)])
+    directory.save_output("policies", output)
+    return Trained(output, directory.read_log("policies"))
+
+
+def best_start(
+    key: jax.Array,
+    env: Episode,
+    objective: policies.Objective,
+    starts: Sequence[PolicyParams],
+    config: PoliciesConfig,
+    reward_fn: RewardFn,
+) -> PolicyParams:
+    """The policy with the highest learned return."""
+    score = jax.jit(
+        lambda policy: (
+            policies.evaluate(key, env, objective, policy, config, reward_fn).learned_return
+        )
+    )
+    return starts[int(np.argmax([float(score(policy)) for policy in starts]))]
+
+
+def load(
+    config: PoliciesConfig, names: Sequence[str], env: Environment, directory: RunDirectory
+) -> dict[str, Callable[[jax.Array], jax.Array]]:
+    """What `run` saved, as deterministic functions of observations, by name."""
+    agent, settings = policies.agent_of(config)
+    key, action_dim = jax.random.PRNGKey(0), env.action_size
+    example = jax.eval_shape(lambda key: _random_policy(key, env, config), key)
+    stacked = directory.load_output(
+        "policies", jax.tree.map(lambda x: shape_like(x, len(names)), example)
+    )
+
+    def policy_of(i):
+        params = jax.tree.map(lambda x: x[i], stacked)
+        # The key is not used: actions are modes.
+        return lambda obs: agent.act(params, obs, key, settings, action_dim, deterministic=True)
+
+    return {name: policy_of(i) for i, name in enumerate(names)}
+
+
+def _random_policy(
+    key: jax.Array, env: Environment | Episode, config: PoliciesConfig
+) -> PolicyParams:
+    agent, settings = policies.agent_of(config)
+    return agent.policy_of(agent.init_learner(key, env.observation_size, env.action_size, settings))
