@@ -33,7 +33,7 @@ demo: $(VENV)/.installed ## demonstrations of two imperfect cheetahs -> rewards,
 	@echo "Report: $(DEMO_OUT)/report.html (open it in a browser)"
 
 test: lint ## ruff, then the whole test suite
-	@$(RUN) pytest
+	@$(RUN) pytest -n 2 --dist loadscope
 
 lint: $(VENV)/.installed-dev ## ruff check and format check
 	@$(RUN) ruff check .

@@ -33,7 +33,7 @@ def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     seeds = range(_SEED.value, _SEED.value + _SEEDS.value)
     every = entries(_TABLES.value, _DOMAINS.value, seeds, _PRESET.value, _OVERRIDE.value)
-    graph = Graph((node for entry in every for node in entry.reports), _OUT.value)
+    graph = Graph((node for entry in every for node in entry.reports.values()), _OUT.value)
     records = _RECORD.value or f"{_OUT.value}/records.jsonl"
     print(f"{len(every)} runs, {len(graph.nodes)} stages, {len(graph.left)} of them left")
     if _DRY_RUN.value:
@@ -55,7 +55,7 @@ def main(argv: list[str]) -> None:
         left = graph.seconds_left()
         said += "" if left is None else f"; {format_duration(left)} left"
         print(f"{number} {node.name}: {state} {said}", flush=True)
-        record(graph, (entry for entry in every if node in entry.reports), records)
+        record(graph, (entry for entry in every if node in entry.reports.values()), records)
 
     graph.run(report)
     bad = [node for node in graph.nodes if graph.states[node.hash] in (FAILED, BLOCKED)]

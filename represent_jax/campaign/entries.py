@@ -25,13 +25,13 @@ class Entry:
       variant: what records call it.
       config: its settings.
       problem: what it is given.
-      reports: the nodes whose outputs are recorded, in order.
+      reports: the nodes whose outputs are recorded, by stage.
     """
 
     variant: str
     config: MethodConfig
     problem: Problem
-    reports: tuple[Node, ...]
+    reports: dict[str, Node]
 
 
 def entries(
@@ -68,8 +68,8 @@ def _entry(variant: str, config: MethodConfig, reached: Sequence[str]) -> Entry:
     stages = find_method(config.method).plan(config, problem)
     made = nodes(config, problem, stages, f"{config.env} {variant} seed {config.seed}")
     last = max(i for i, stage in enumerate(stages) if stage.name in reached)
-    reports = [made[stage.name] for stage in stages[: last + 1] if stage.reports]
-    return Entry(VARIANTS[variant].name, config, problem, tuple(reports))
+    reports = {stage.name: made[stage.name] for stage in stages[: last + 1] if stage.reports}
+    return Entry(VARIANTS[variant].name, config, problem, reports)
 
 
 @functools.cache
@@ -88,7 +88,7 @@ def record(graph: Graph, every: Iterable[Entry], path: str | os.PathLike) -> Non
     Called whenever a node ends it loses nothing, and called again it adds nothing.
     """
     for entry in every:
-        for node in entry.reports:
+        for node in entry.reports.values():
             if graph.is_done(node):
                 results = describe(entry.config, entry.problem) | graph.output(node)
                 results["seconds"] = {node.name: graph.seconds_in_all(node)}

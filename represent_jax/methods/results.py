@@ -242,6 +242,7 @@ def judge_policies(
             "return_final_std": float(np.std(true)),
             "return_last": path["true_return"][-1] if log else final,
             "return_best": max([*path["true_return"], final]),
+            "env_steps_to_90_percent": _env_steps_to(0.9, log, path["true_return"]),
             "learned_return_final": (
                 float(np.mean(learned[name](batch))) if name in learned else None
             ),
@@ -252,6 +253,16 @@ def judge_policies(
     if log:
         directory.save_arrays("learning_curves", curves)
     return {"policies": results}
+
+
+def _env_steps_to(
+    share: float, log: Sequence[Mapping[str, Any]], true_returns: Sequence[float]
+) -> int | None:
+    """Env steps after which a share of the last return was first reached; None without a log."""
+    for line, value in zip(log, true_returns, strict=True):
+        if value >= share * true_returns[-1]:
+            return line["step"]
+    return None
 
 
 def _style_judge(key: jax.Array, problem: Problem) -> Callable[[TrajectoryBatch], jax.Array]:

@@ -73,7 +73,7 @@ def noise_curves(curves: Mapping[str, Mapping[str, Any]]) -> Figure:
     Args:
         curves: the entries of results.json's "curve", by target.
     """
-    with _panels(len(curves)) as (figure, axes):
+    with panels(len(curves)) as (figure, axes):
         for ax, (target, curve) in zip(axes, curves.items(), strict=True):
             _draw_noise_curve(ax, target, curve)
     return figure
@@ -86,7 +86,7 @@ def scatters(points: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]) 
         points: by target and group ("demonstrations", "test", "noisy_1", ...), the true and the
             learned returns, both [n].
     """
-    with _panels(len(points), (PANEL_INCHES[0], PANEL_INCHES[1] + 0.35)) as (figure, axes):
+    with panels(len(points), (PANEL_INCHES[0], PANEL_INCHES[1] + 0.35)) as (figure, axes):
         for ax, (target, groups) in zip(axes, points.items(), strict=True):
             _draw_scatter(ax, target, groups)
     return figure
@@ -104,7 +104,7 @@ def learning_curves(
             demonstrator of all.
     """
     size = (PANEL_INCHES[0], PANEL_INCHES[1] + 0.8)
-    with _panels(len(curves), size, rows=(3.0, 2.0)) as (figure, axes):
+    with panels(len(curves), size, rows=(3.0, 2.0)) as (figure, axes):
         columns = zip(axes[::2], axes[1::2], curves.items(), strict=True)
         for ax_true, ax_learned, (target, curve) in columns:
             levels = (demonstrators or {}).get(target)
@@ -131,7 +131,7 @@ def svg_data_uri(figure: Figure) -> str:
 
 
 @contextlib.contextmanager
-def _panels(
+def panels(
     num: int, inches: tuple[float, float] = PANEL_INCHES, rows: tuple[float, ...] = (1.0,)
 ) -> Iterator[tuple[Figure, list[Axes]]]:
     """Yields a figure of `num` columns and its axes, column by column."""

@@ -1,0 +1,82 @@
+"""Tables from records: what counts, what is shown beside it, and in which formats."""
+
+import json
+
+import numpy as np
+import pytest
+
+from represent_jax.campaign import formats, paper, tables
+from represent_jax.errors import RepresentError, UsageError
+
+
+def _record(target, quantity, seed, value, method="represent", domain="hopper", preset="quick"):
+    names = ("domain", "target", "method", "quantity", "seed", "value", "preset")
+    values = (domain, target, method, quantity, seed, value, preset)
+    return dict(zip(names, values, strict=True))
+
+
+def test_seeds_are_aggregated_and_the_newest_record_of_a_run_counts():
+    records = [
+        _record("task", "pearson_pooled", 0, 0.1),
+        _record("task", "pearson_pooled", 0, 0.9),
+        _record("task", "pearson_pooled", 1, 0.7),
+        _record("task", "pearson_pooled", 2, 0.3, preset="smoke"),
+        _record("task", "pearson_pooled", 3, None),
+    ]
+    _, cells = tables.make("1", records, "quick")
+    (cell,) = cells
+    assert cell.found.num == 2 and cell.found.mean == pytest.approx(0.8)
+    assert cell.paper == (0.949, 0.002)
+
+
+def test_imitation_is_shown_as_a_method_of_its_own():
+    records = [_record("strategy_1", "airl_return", 0, 900.0)]
+    records += [_record("strategy_1", "airl_pearson_test", 0, 0.5)]
+    for name, quantity in (("2", "return_final"), ("1", "pearson_test")):
+        _, (cell,) = tables.make(name, records, "quick")
+        assert (cell.method, cell.quantity) == ("airl", quantity)
+
+
+def test_demonstrators_of_the_task_are_those_of_all_strategies():
+    records = [_record("strategy_1", "demo_return", seed, 1000.0) for seed in (0, 1)]
+    records += [_record("strategy_2", "demo_return", 0, 2000.0)]
+    _, cells = tables.make("2", records, "quick")
+    found = {cell.target: cell.found.mean for cell in cells if cell.method == "demonstrators"}
+    assert found == {"task": 1500.0, "strategy_1": 1000.0, "strategy_2": 2000.0}
+
+
+def test_the_papers_percentages_follow_from_its_returns():
+    shown = {("hopper", "strategy_1"): 110, ("half_cheetah", "strategy_2"): 329}
+    for (domain, target), percent in shown.items():
+        ours = paper.RETURNS[domain, target, "represent"]
+        demonstrated = paper.RETURNS[domain, target, "demonstrators"]
+        assert round(100 * ours / demonstrated) == percent
+
+
+@pytest.mark.parametrize("style", formats.FORMATS)
+def test_formats_hold_the_same_figures(style):
+    records = [_record("task", "return_best", seed, 1000.0 + 10 * seed) for seed in range(5)]
+    title, cells = tables.make("2", records, "quick")
+    text = formats.render(style, title, cells)
+    if style == "json":
+        (cell,) = json.loads(text)["cells"]
+        assert cell["found"]["mean"] == 1020.0
+    else:
+        assert "1,020" in text and "1,692" in text and "REPRESENT" in text
+    if style == "latex":
+        assert text.count(r"\\") == 2 and "%" not in text.replace(r"\%", "")
+
+
+def test_json_of_a_single_seed_is_strict():
+    title, cells = tables.make("2", [_record("task", "return_best", 0, 1.0)], "quick")
+    (cell,) = json.loads(formats.render("json", title, cells))["cells"]
+    assert cell["found"]["std"] is None and np.isfinite(cell["found"]["mean"])
+
+
+def test_unknown_names_and_empty_tables_are_errors():
+    with pytest.raises(UsageError, match="ablations"):
+        tables.make("ablation", [], "quick")
+    with pytest.raises(RepresentError, match="no record"):
+        tables.make("3", [_record("task", "return_best", 0, 1.0, preset="smoke")], "quick")
+    with pytest.raises(UsageError, match="markdown"):
+        formats.render("markdwn", "", [])

@@ -1,0 +1,73 @@
+"""What a campaign runs, and what its runs share."""
+
+import pytest
+
+from represent_jax.campaign.entries import entries
+from represent_jax.campaign.variants import TABLES, VARIANTS, runs_of
+from represent_jax.errors import UsageError
+from represent_jax.methods.plan import nodes
+from represent_jax.methods.registry import find_method
+
+
+def test_runs_of_tables_are_their_union():
+    wanted = runs_of(["1", "2"], ["hopper"])
+    assert set(wanted) == {"hopper"}
+    assert set(wanted["hopper"]) == {*TABLES["1"].until, *TABLES["2"].until}
+    assert wanted["hopper"]["represent"] == ("reward_evaluation", "policy_evaluation")
+    assert wanted["hopper"]["bc"] == ("policy_evaluation",)
+    # Table III speaks of Hopper alone.
+    assert set(runs_of(["1", "3"], ["half_cheetah"])["half_cheetah"]) == set(TABLES["1"].until)
+
+
+@pytest.mark.parametrize(
+    ("tables", "domains", "message"),
+    [
+        (["11"], ["hopper"], "unknown table"),
+        (["1"], ["hoper"], "hopper"),
+        (["3"], ["half_cheetah"], "do not speak"),
+    ],
+)
+def test_unknown_names_are_errors(tables, domains, message):
+    with pytest.raises(UsageError, match=message):
+        runs_of(tables, domains)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_variant_has_the_stages_that_its_tables_need(variant):
+    method = find_method(VARIANTS[variant].method)
+    config = VARIANTS[variant].config("smoke", "half_cheetah", ["airl.env_steps=320", "seed=3"])
+    assert config.seed == 3 and isinstance(config, method.config)
+
+
+@pytest.fixture(scope="module")
+def hashes():
+    """Hash of every stage that some runs need, by run and stage."""
+    found = {}
+    for seed in (0, 1):
+        for entry in entries(["1", "ablations"], ["half_cheetah"], [seed], "smoke"):
+            stages = find_method(entry.config.method).plan(entry.config, entry.problem)
+            made = nodes(entry.config, entry.problem, stages, "run")
+            grouping = entry.config.grouping
+            for stage, node in made.items():
+                found[entry.variant, grouping, seed, stage] = node.hash
+    return found
+
+
+def test_methods_share_the_stages_that_are_the_same_for_both(hashes):
+    own = {stage: value for (*run, stage), value in hashes.items() if run == _run("represent")}
+    for variant in ("ssrr", "no_reg", "no_bcd", "shared", "ensemble_1"):
+        for stage in ("airl", "airl_evaluation", "noise", "curve"):
+            assert hashes[*_run(variant), stage] == own[stage]
+        for stage in ("regression", "policies", "policy_evaluation"):
+            assert hashes[*_run(variant), stage] != own[stage]
+    assert hashes["ssrr", "merged", 0, "airl"] != own["airl"]
+
+
+def test_every_stage_depends_on_the_seed(hashes):
+    for (variant, grouping, seed, stage), value in hashes.items():
+        if seed == 0:
+            assert value != hashes[variant, grouping, 1, stage]
+
+
+def _run(variant):
+    return [variant, "separate", 0]
