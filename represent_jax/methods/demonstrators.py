@@ -42,8 +42,6 @@ class DemonstratorConfig:
       demonstration_horizon: steps after which a demonstration is cut off; 0 is the environment's
         own. Where the wanted episodes end early by themselves, a lower one saves rolling out
         later skills in full at every snapshot.
-      learns_terminating: whether the agents learn where falling ends an episode, although they
-        demonstrate where it does not: otherwise lying down is a style.
       steadiness_weight: weight, in judging a snapshot, of how much the two halves of its episodes
         differ; by its mean return alone, who runs and then falls passes for one who walks.
       strategy_order: which of the chosen skills becomes which strategy; as chosen if empty.
@@ -63,7 +61,6 @@ class DemonstratorConfig:
     target_returns: tuple[float, ...] = (1243.13, 1172.71, 1181.35)
     trajectories_per_skill: int = 4
     demonstration_horizon: int = 0
-    learns_terminating: bool = False
     steadiness_weight: float = 0.0
     strategy_order: tuple[int, ...] = ()
     min_skill_accuracy: float = 0.9
@@ -109,14 +106,17 @@ DEMONSTRATORS = {
     ),
     "hopper": DemonstratorConfig(
         env="hopper",
-        env_steps=1_280_000,
+        env_steps=880_000,
         test_env_steps=960_000,
         snapshot_env_steps=16_000,
         target_returns=(1197.93, 1587.98),
-        learns_terminating=True,
         steadiness_weight=1.0,
         test_trajectories_per_skill=3,
-        diayn=DiaynConfig(num_skills=2, diversity_weight=0.5, diversity_floor=0.0, sac=_SAC),
+        diayn=DiaynConfig(
+            num_skills=2,
+            diversity_weight=0.5,
+            sac=dataclasses.replace(_SAC, initial_temperature=1.0),
+        ),
     ),
     "inverted_double_pendulum": DemonstratorConfig(
         env="inverted_double_pendulum",
@@ -164,8 +164,7 @@ def train(
 ) -> list[Snapshot]:
     """Trains one DIAYN agent and rolls out every skill at every snapshot."""
     env = make_env(config.env, backend)
-    learned = make_env(config.env, backend, terminates=True) if config.learns_terminating else env
-    episodes, whole = Episode(learned), Episode(env, horizon or env.horizon, auto_reset=False)
+    episodes, whole = Episode(env), Episode(env, horizon or env.horizon, auto_reset=False)
     diayn_config = config.diayn
     key_init, key_rollout = jax.random.split(jax.random.PRNGKey(seed))
     state = jax.jit(lambda key: diayn.init(key, episodes, diayn_config))(key_init)

@@ -108,3 +108,21 @@ def test_bad_usage_is_one_line(tmp_path):
     output, _ = process.communicate(timeout=120)
     assert process.returncode == 2
     assert "unknown table" in output and "Traceback" not in output
+
+
+def test_figures_are_drawn_from_its_folder(campaign, tmp_path):
+    out, _, _ = campaign
+    command = [sys.executable, "-m", "experiments.figures", f"--campaign={out}", "--seeds=1"]
+    flags = ["--preset=smoke", "--domains=inverted_double_pendulum", f"--out={tmp_path}"]
+    shown = subprocess.run(
+        [*command, *flags], cwd=ROOT, capture_output=True, text=True, timeout=200
+    )
+    assert shown.returncode == 0, shown.stderr
+    drawn = {path.name for path in tmp_path.glob("*.png")}
+    names = {
+        f"figure_{n}_inverted_double_pendulum_{m}.png"
+        for n in (3, 4)
+        for m in ("represent", "ssrr")
+    }
+    # Policies are no part of Table I, so there is no Figure 5.
+    assert drawn == names
