@@ -19,6 +19,8 @@ from represent_jax.methods.config import make_problem
 from represent_jax.methods.presets import make_config
 
 ROOT = Path(__file__).parents[2]
+# The task whose physics MJX compiles soonest.
+IN_XLA = ("--env=inverted_double_pendulum", "--backend=mjx")
 
 
 def _launch(out, *flags, cache=None):
@@ -58,7 +60,7 @@ def finished(tmp_path_factory, cache):
     """A whole run in pure XLA, from demonstrations to policies."""
     out = tmp_path_factory.mktemp("run") / "whole"
     record = out.parent / "records.jsonl"
-    output = _finish(_launch(out, "--backend=mjx", f"--record={record}", cache=cache))
+    output = _finish(_launch(out, *IN_XLA, f"--record={record}", cache=cache))
     return out, record, output
 
 
@@ -89,7 +91,7 @@ def test_run_directory_has_everything(finished):
 def test_killed_at_three_points_and_resumed_ends_in_the_same_results(finished, cache, tmp_path):
     whole, _, _ = finished
     out = tmp_path / "killed"
-    flags = ("--backend=mjx", "--resume", "--checkpoint_seconds=0")
+    flags = (*IN_XLA, "--resume", "--checkpoint_seconds=0")
     for stage in ("airl", "regression", "policies"):
         process = _launch(out, *flags, cache=cache)
         deadline = time.monotonic() + 300
@@ -183,13 +185,15 @@ def test_evaluate_judges_a_finished_run(finished):
 def test_loaded_reward_and_policy(finished):
     out, _, _ = finished
     reward, policy = rj.load_reward(out), rj.load_policy(out, target="strategy_1")
-    obs, action = np.zeros((5, 17), np.float32), np.zeros((5, 6), np.float32)
+    env = rj.make_env("inverted_double_pendulum", "mujoco")
+    obs = np.zeros((5, env.observation_size), np.float32)
+    action = np.zeros((5, env.action_size), np.float32)
     task = reward(obs, action, obs)
     strategy = reward(obs, action, obs, target="strategy_2")
     assert task.shape == (5,) and bool(np.any(task != strategy))
     jitted = jax.jit(jax.vmap(lambda o: reward(o, action[0], o)))(obs)
     np.testing.assert_allclose(jitted, task, rtol=1e-5)
-    assert policy(obs).shape == (5, 6) and float(np.abs(policy(obs)).max()) <= 1.0
+    assert policy(obs).shape == action.shape and float(np.abs(policy(obs)).max()) <= 1.0
     with pytest.raises(UsageError, match="strategy_2"):
         reward(obs, action, obs, target="strategy_3")
     with pytest.raises(UsageError, match="strategy_1"):
