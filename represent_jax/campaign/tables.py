@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from represent_jax.campaign import paper
 from represent_jax.campaign.statistics import Aggregate, aggregate
-from represent_jax.campaign.variants import DOMAINS
+from represent_jax.campaign.variants import ABLATIONS, DOMAINS
 from represent_jax.errors import RepresentError, unknown
 from represent_jax.report.tables import Table
 from represent_jax.report.values import display_name, format_number
@@ -22,11 +22,13 @@ METHOD_NAMES = {
     "drex": "D-REX",
     "bc": "BC",
     "bc_rnn": "BC-RNN",
-    "airl": "Noisy-AIRL",
+    "noisy_airl": "Noisy-AIRL",
+    "airl": "AIRL",
     "demonstrators": "Demonstrators",
     "no_reg": "without L_reg",
     "no_bcd": "without L_BCD",
     "shared": "R^0 alone",
+    "no_sigmoid": "without the sigmoid",
     "ensemble_1": "ensemble of one",
     "literal_bcd": "Eq. 5 literally",
     "cold": "cold start",
@@ -96,8 +98,7 @@ def correlations(select: Select) -> list[Cell]:
                 cells.append(select.cell(domain, target, method, "pearson_pooled", published))
                 cells.append(select.cell(domain, target, method, "pearson_test"))
             if target != "task":
-                cells.append(select.cell(domain, target, "represent", "airl_pearson_test"))
-                cells[-1] = cells[-1]._replace(method="airl", quantity="pearson_test")
+                cells += _imitation(select, domain, target, "pearson_test")
     return cells
 
 
@@ -113,8 +114,7 @@ def returns(select: Select) -> list[Cell]:
                 cells.append(select.cell(domain, target, method, "return_best", published))
                 cells.append(select.cell(domain, target, method, "return_final"))
             if target != "task":
-                cells.append(select.cell(domain, target, "represent", "airl_return"))
-                cells[-1] = cells[-1]._replace(method="airl", quantity="return_final")
+                cells += _imitation(select, domain, target, "return_final")
     return cells
 
 
@@ -123,7 +123,7 @@ def ablations(select: Select) -> list[Cell]:
     return [
         select.cell("hopper", target, method, quantity, published)
         for target in _TARGETS
-        for method in ("represent", "no_reg", "no_bcd", "ssrr")
+        for method in ("represent", *ABLATIONS)
         for quantity in _RETURNS
         for published in [
             paper.ABLATIONS.get((target, method)) if quantity == "return_best" else None
@@ -149,7 +149,15 @@ def further_ablations(select: Select) -> list[Cell]:
         select.cell(domain, target, method, quantity)
         for domain in DOMAINS
         for target in _TARGETS
-        for method in ("represent", "no_reg", "no_bcd", "shared", "ensemble_1", "literal_bcd")
+        for method in (
+            "represent",
+            "no_reg",
+            "no_bcd",
+            "shared",
+            "no_sigmoid",
+            "ensemble_1",
+            "literal_bcd",
+        )
         for quantity in ("pearson_pooled", "pearson_test")
     ]
 
@@ -234,6 +242,15 @@ _QUANTITY_NAMES = {
     "return_final": "kept",
     "demo_return": "demonstrated",
 }
+
+
+def _imitation(select: Select, domain: str, target: str, quantity: str) -> list[Cell]:
+    """Phase 1 by itself, with and without noise in its training."""
+    recorded = {"pearson_test": "airl_pearson_test", "return_final": "airl_return"}[quantity]
+    return [
+        select.cell(domain, target, variant, recorded)._replace(method=method, quantity=quantity)
+        for variant, method in (("represent", "noisy_airl"), ("airl", "airl"))
+    ]
 
 
 def _demonstrated(

@@ -51,9 +51,13 @@ VARIANTS = {
     "shared": Variant("shared", "represent", ("regression.strategy_weight=0",)),
     "ensemble_1": Variant("ensemble_1", "represent", ("regression.ensemble_size=1",)),
     "literal_bcd": Variant("literal_bcd", "represent", ("regression.discrimination=literal",)),
+    "no_sigmoid": Variant("no_sigmoid", "represent", ("curve.targets=returns",)),
+    "airl": Variant("airl", "represent", ("airl.noisy=false",)),
     "cold": Variant("cold", "represent", ("policies.start=cold",)),
     "three_strategies": Variant("three_strategies", "represent", ("num_strategies=3",)),
 }
+
+ABLATIONS = ("no_reg", "no_bcd", "shared", "no_sigmoid", "ensemble_1", "literal_bcd")
 
 _REWARDS, _POLICIES = "reward_evaluation", "policy_evaluation"
 _DECOMPOSING = ("represent", "ssrr", "ssrr_separate", "msrd", "drex")
@@ -73,19 +77,14 @@ class TableRuns:
 
 
 TABLES = {
-    "1": TableRuns(DOMAINS, dict.fromkeys(_DECOMPOSING, _REWARDS)),
+    "1": TableRuns(DOMAINS, dict.fromkeys(_DECOMPOSING, _REWARDS) | {"airl": "airl_evaluation"}),
     "2": TableRuns(DOMAINS, dict.fromkeys((*_DECOMPOSING, "bc", "bc_rnn"), _POLICIES)),
     "3": TableRuns(
         ("hopper",),
         dict.fromkeys(("represent", "no_reg", "no_bcd", "ssrr", "ssrr_separate"), _POLICIES),
     ),
     "5": TableRuns(("half_cheetah",), {"three_strategies": _POLICIES}),
-    "ablations": TableRuns(
-        DOMAINS,
-        dict.fromkeys(
-            ("represent", "no_reg", "no_bcd", "shared", "ensemble_1", "literal_bcd"), _REWARDS
-        ),
-    ),
+    "ablations": TableRuns(DOMAINS, dict.fromkeys(("represent", *ABLATIONS), _REWARDS)),
     "cold": TableRuns(DOMAINS, dict.fromkeys(("represent", "cold"), _POLICIES)),
 }
 

@@ -241,7 +241,8 @@ def run_regressions(
 def _regression_data(
     config: RepresentConfig, problem: Problem, noisy: noise.NoisyData, curves: curve.Curve
 ) -> regression.RegressionData:
-    targets = jnp.repeat(curves.fitted, config.noise.trajectories_per_level, axis=1)
+    values = curves.fitted if config.curve.targets == "curve" else curves.scaled_returns
+    targets = jnp.repeat(values, config.noise.trajectories_per_level, axis=1)
     return regression.RegressionData(noisy.trajectories, targets, padded_demonstrations(problem))
 
 

@@ -46,7 +46,7 @@ class AirlConfig:
       sac, ppo: the generators.
     """
 
-    env_steps: int = 160_000
+    env_steps: int = 240_000
     agent: str = "sac"
     cloning_updates: int = 2_000
     noisy: bool = True

@@ -71,6 +71,8 @@ class CurveConfig:
     Attributes:
         statistic: what stands for the trajectories of a level: their "median", which one fallen
             robot does not move, or the "mean" of the paper.
+        targets: what the regression learns from: the "curve", or the "returns" of each level as
+            they are, without a curve through them (an ablation).
         num_iterations: Levenberg-Marquardt iterations of every start.
         steepest: largest -k, per unit of noise level.
         flattest: smallest -k; above zero, so that the sigmoid can only fall.
@@ -84,6 +86,7 @@ class CurveConfig:
     """
 
     statistic: str = "median"
+    targets: str = "curve"
     num_iterations: int = 60
     steepest: float = 50.0
     flattest: float = 0.1
@@ -95,6 +98,9 @@ class CurveConfig:
     def __post_init__(self):
         require(
             self.statistic in ("median", "mean"), "statistic", "'median' or 'mean'", self.statistic
+        )
+        require(
+            self.targets in ("curve", "returns"), "targets", "'curve' or 'returns'", self.targets
         )
         require(self.num_iterations >= 1, "num_iterations", "at least 1", self.num_iterations)
         require(

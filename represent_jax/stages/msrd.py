@@ -62,7 +62,7 @@ class MsrdConfig:
       sac: the generators.
     """
 
-    env_steps: int = 160_000
+    env_steps: int = 240_000
     cloning_updates: int = 2_000
     hidden_sizes: tuple[int, ...] = (64, 64)
     learning_rate: float = 3e-4

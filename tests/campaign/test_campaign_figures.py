@@ -8,7 +8,9 @@ from represent_jax.campaign.figures import learning
 def test_mean_and_spread_over_seeds_are_drawn():
     steps = np.array([10.0, 20.0, 30.0])
     seeds = [(steps, np.array([0.0, 1.0, 4.0])), (steps, np.array([2.0, 3.0, 6.0]))]
-    figure = learning({"task": {"represent": seeds, "ssrr": seeds[:1]}, "strategy_1": {"ssrr": seeds}})
+    figure = learning(
+        {"task": {"represent": seeds, "ssrr": seeds[:1]}, "strategy_1": {"ssrr": seeds}}
+    )
     axes = figure.axes[0]
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["Task", "Strategy 1"]
     drawn = {line.get_label(): line.get_ydata() for line in axes.get_lines()}

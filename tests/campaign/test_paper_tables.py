@@ -34,7 +34,7 @@ def test_imitation_is_shown_as_a_method_of_its_own():
     records += [_record("strategy_1", "airl_pearson_test", 0, 0.5)]
     for name, quantity in (("2", "return_final"), ("1", "pearson_test")):
         _, (cell,) = tables.make(name, records, "quick")
-        assert (cell.method, cell.quantity) == ("airl", quantity)
+        assert (cell.method, cell.quantity) == ("noisy_airl", quantity)
 
 
 def test_demonstrators_of_the_task_are_those_of_all_strategies():

@@ -55,11 +55,12 @@ def hashes():
 
 def test_methods_share_the_stages_that_are_the_same_for_both(hashes):
     own = {stage: value for (*run, stage), value in hashes.items() if run == _run("represent")}
-    for variant in ("ssrr", "no_reg", "no_bcd", "shared", "ensemble_1"):
-        for stage in ("airl", "airl_evaluation", "noise", "curve"):
+    for variant in ("ssrr", "no_reg", "no_bcd", "shared", "no_sigmoid", "ensemble_1"):
+        for stage in ("airl", "airl_evaluation", "noise"):
             assert hashes[*_run(variant), stage] == own[stage]
         for stage in ("regression", "policies", "policy_evaluation"):
             assert hashes[*_run(variant), stage] != own[stage]
+        assert (hashes[*_run(variant), "curve"] == own["curve"]) == (variant != "no_sigmoid")
     assert hashes["ssrr", "merged", 0, "airl"] != own["airl"]
 
 
