@@ -20,6 +20,7 @@ from represent_jax.runs.graph import BLOCKED, FAILED, Graph, Node
 
 _TABLES = flags.DEFINE_list("tables", ["1", "2", "3", "5"], f"Of {', '.join(TABLES)}.")
 _DOMAINS = flags.DEFINE_list("domains", list(DOMAINS), "Environments.")
+_VARIANTS = flags.DEFINE_list("variants", [], "Of a table's methods and ablations; all if empty.")
 _SEEDS = flags.DEFINE_integer("seeds", 5, "Number of seeds.", lower_bound=1)
 _SEED = flags.DEFINE_integer("seed", 0, "First of the seeds.", lower_bound=0)
 _PRESET = flags.DEFINE_string("preset", "paper", "Settings to begin with: smoke, quick or paper.")
@@ -32,7 +33,9 @@ _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Show what is done and left, and 
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     seeds = range(_SEED.value, _SEED.value + _SEEDS.value)
-    every = entries(_TABLES.value, _DOMAINS.value, seeds, _PRESET.value, _OVERRIDE.value)
+    every = entries(
+        _TABLES.value, _DOMAINS.value, seeds, _PRESET.value, _OVERRIDE.value, _VARIANTS.value
+    )
     graph = Graph((node for entry in every for node in entry.reports.values()), _OUT.value)
     records = _RECORD.value or f"{_OUT.value}/records.jsonl"
     print(f"{len(every)} runs, {len(graph.nodes)} stages, {len(graph.left)} of them left")

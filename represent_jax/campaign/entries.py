@@ -40,18 +40,19 @@ def entries(
     seeds: Sequence[int],
     preset: str,
     overrides: Sequence[str] = (),
+    variants: Sequence[str] = (),
 ) -> list[Entry]:
     """The runs behind some tables, seed by seed, so that every seed adds to all of them.
 
     Raises:
-      UsageError: no table, domain or preset of that name, or a setting that does not fit.
+      UsageError: no table, domain, variant or preset of that name, or a setting that does not fit.
       RepresentError: demonstrations do not fit their environment.
     """
-    wanted = runs_of(tables, domains)
+    wanted = runs_of(tables, domains, variants)
     found = []
     for seed in seeds:
-        for domain, variants in wanted.items():
-            for variant, reached in variants.items():
+        for domain, runs in wanted.items():
+            for variant, reached in runs.items():
                 config = VARIANTS[variant].config(preset, domain, [*overrides, f"seed={seed}"])
                 found.append(_entry(variant, config, reached))
     return found

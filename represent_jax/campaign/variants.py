@@ -89,12 +89,22 @@ TABLES = {
 }
 
 
-def runs_of(tables: Sequence[str], domains: Sequence[str]) -> dict[str, dict[str, tuple[str, ...]]]:
+def runs_of(
+    tables: Sequence[str], domains: Sequence[str], variants: Sequence[str] = ()
+) -> dict[str, dict[str, tuple[str, ...]]]:
     """The runs behind some tables: by domain and variant, the stages that have to be reached.
 
+    Args:
+      tables: names of tables.
+      domains: environments to take of those a table speaks of.
+      variants: those to take of a table's; all if empty.
+
     Raises:
-      UsageError: no table, or no domain, of that name.
+      UsageError: no table, domain or variant of that name, or nothing is left.
     """
+    for variant in variants:
+        if variant not in VARIANTS:
+            raise unknown("variant", variant, VARIANTS)
     for table in tables:
         if table not in TABLES:
             raise unknown("table", table, TABLES)
@@ -107,8 +117,11 @@ def runs_of(tables: Sequence[str], domains: Sequence[str]) -> dict[str, dict[str
             if domain not in TABLES[table].domains:
                 continue
             for variant, until in TABLES[table].until.items():
+                if variants and variant not in variants:
+                    continue
                 reached = wanted.setdefault(domain, {}).setdefault(variant, ())
                 wanted[domain][variant] = tuple(dict.fromkeys((*reached, until)))
     if not wanted:
-        raise UsageError(f"tables {', '.join(tables)} do not speak of {', '.join(domains)}")
+        asked = ", ".join((*domains, *variants))
+        raise UsageError(f"tables {', '.join(tables)} do not speak of {asked}")
     return wanted

@@ -17,19 +17,22 @@ def test_runs_of_tables_are_their_union():
     assert wanted["hopper"]["bc"] == ("policy_evaluation",)
     # Table III speaks of Hopper alone.
     assert set(runs_of(["1", "3"], ["half_cheetah"])["half_cheetah"]) == set(TABLES["1"].until)
+    assert list(runs_of(["1"], ["hopper"], ["msrd"])["hopper"]) == ["msrd"]
 
 
 @pytest.mark.parametrize(
-    ("tables", "domains", "message"),
+    ("tables", "domains", "variants", "message"),
     [
-        (["11"], ["hopper"], "unknown table"),
-        (["1"], ["hoper"], "hopper"),
-        (["3"], ["half_cheetah"], "do not speak"),
+        (["11"], ["hopper"], [], "unknown table"),
+        (["1"], ["hoper"], [], "hopper"),
+        (["1"], ["hopper"], ["ssr"], "ssrr"),
+        (["5"], ["half_cheetah"], ["bc"], "do not speak"),
+        (["3"], ["half_cheetah"], [], "do not speak"),
     ],
 )
-def test_unknown_names_are_errors(tables, domains, message):
+def test_unknown_names_are_errors(tables, domains, variants, message):
     with pytest.raises(UsageError, match=message):
-        runs_of(tables, domains)
+        runs_of(tables, domains, variants)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
