@@ -64,7 +64,8 @@ def _curves(graph: Graph, runs: list[Entry]) -> dict:
     for run in runs:
         node = run.reports["reward_evaluation"]
         if graph.is_done(node):
-            found |= dict(zip(run.config.group_names, graph.output(node)["curve"], strict=True))
+            curves = graph.directory(node).load_findings("reward_evaluation")["curve"]
+            found |= dict(zip(run.config.group_names, curves, strict=True))
     return found
 
 

@@ -89,9 +89,10 @@ def record(graph: Graph, every: Iterable[Entry], path: str | os.PathLike) -> Non
     Called whenever a node ends it loses nothing, and called again it adds nothing.
     """
     for entry in every:
-        for node in entry.reports.values():
+        for stage, node in entry.reports.items():
             if graph.is_done(node):
-                results = describe(entry.config, entry.problem) | graph.output(node)
+                results = describe(entry.config, entry.problem)
+                results |= graph.directory(node).load_findings(stage)
                 results["seconds"] = {node.name: graph.seconds_in_all(node)}
                 config_hash = configs.config_hash(entry.config)
                 append_results(path, entry.variant, config_hash, results, only_new=True)
