@@ -32,6 +32,8 @@ METHOD_NAMES = {
     "ensemble_1": "ensemble of one",
     "literal_bcd": "Eq. 5 literally",
     "cold": "cold start",
+    "scratch": "REPRESENT",
+    "ssrr_scratch": "SSRR",
     "three_strategies": "REPRESENT",
 }
 _TARGETS = ("task", "strategy_1", "strategy_2")
@@ -173,12 +175,23 @@ def cold_starts(select: Select) -> list[Cell]:
     ]
 
 
+def speeds(select: Select) -> list[Cell]:
+    """Figure 5 in numbers: env steps after which 90 % of the last return was first reached."""
+    return [
+        select.cell("inverted_double_pendulum", target, method, quantity)
+        for target in _TARGETS
+        for method in ("scratch", "ssrr_scratch")
+        for quantity in ("env_steps_to_90_percent", "return_last")
+    ]
+
+
 TABLES: dict[str, tuple[str, Callable[[Select], list[Cell]]]] = {
     "1": ("Table I. Correlation of learned with true return", correlations),
     "2": ("Table II. True return of policies", returns),
     "3": ("Table III. Hopper without one of the losses: true return of policies", ablations),
     "5": ("Table V. Three strategies on HalfCheetah", three_strategies),
     "ablations": ("Where the gain comes from", further_ablations),
+    "figure_5": ("Figure 5. How fast policies learn from random networks", speeds),
     "cold": ("Policies from Phase 1's and from random networks: true return", cold_starts),
 }
 
@@ -240,6 +253,8 @@ _QUANTITY_NAMES = {
     "pearson_test": "r, unseen",
     "return_best": "highest",
     "return_final": "kept",
+    "return_last": "last",
+    "env_steps_to_90_percent": "env steps to 90 %",
     "demo_return": "demonstrated",
 }
 

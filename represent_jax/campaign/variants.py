@@ -36,6 +36,15 @@ class Variant:
         return configs.apply_overrides(config, [*self.overrides, *general])
 
 
+# Figure 5 shows how fast policies learn: from random networks, evaluated often.
+_FROM_SCRATCH = (
+    "policies.start=cold",
+    "policies.env_steps=60_000",
+    "policies.eval_env_steps=2_000",
+    "policies.sac.warmup_env_steps=1_920",
+    "policies.sac.critic_warmup_updates=0",
+)
+
 # SSRR appears twice: the tables' task row is on merged demonstrations, their strategy rows are on
 # each strategy's own. Both are recorded as "ssrr"; their targets differ.
 VARIANTS = {
@@ -54,6 +63,9 @@ VARIANTS = {
     "no_sigmoid": Variant("no_sigmoid", "represent", ("curve.targets=returns",)),
     "airl": Variant("airl", "represent", ("airl.noisy=false",)),
     "cold": Variant("cold", "represent", ("policies.start=cold",)),
+    "scratch": Variant("scratch", "represent", _FROM_SCRATCH),
+    "ssrr_scratch": Variant("ssrr_scratch", "ssrr", _FROM_SCRATCH),
+    "ssrr_separate_scratch": Variant("ssrr_scratch", "ssrr", ("grouping=separate", *_FROM_SCRATCH)),
     "three_strategies": Variant("three_strategies", "represent", ("num_strategies=3",)),
 }
 
@@ -85,6 +97,10 @@ TABLES = {
     ),
     "5": TableRuns(("half_cheetah",), {"three_strategies": _POLICIES}),
     "ablations": TableRuns(DOMAINS, dict.fromkeys(("represent", *ABLATIONS), _REWARDS)),
+    "figure_5": TableRuns(
+        ("inverted_double_pendulum",),
+        dict.fromkeys(("scratch", "ssrr_scratch", "ssrr_separate_scratch"), _POLICIES),
+    ),
     "cold": TableRuns(DOMAINS, dict.fromkeys(("represent", "cold"), _POLICIES)),
 }
 
