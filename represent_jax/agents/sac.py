@@ -43,6 +43,9 @@ class SacConfig:
       target_update_rate: share of the critics that enters the target critics at each update.
       initial_temperature: the entropy's weight at the start.
       learn_temperature: whether the temperature follows the target entropy, -action_dim / 2.
+      prior_weight: weight of staying near the policy it starts from: -log pi_1 of the actor's own
+        actions in its loss (BRAC-p, https://arxiv.org/abs/1911.11361). Critics that know only
+        pi_1's actions otherwise send the actor where they know nothing.
       reward_scale: factor on the reward.
       normalize_observations: whether networks see observations in units of their running spread.
     """
@@ -59,6 +62,7 @@ class SacConfig:
     target_update_rate: float = 0.005
     initial_temperature: float = 1.0
     learn_temperature: bool = True
+    prior_weight: float = 0.0
     reward_scale: float = 1.0
     normalize_observations: bool = False
 
@@ -80,6 +84,7 @@ class SacConfig:
             "at least 0",
             self.critic_warmup_updates,
         )
+        require(self.prior_weight >= 0.0, "prior_weight", ">= 0", self.prior_weight)
         rate = self.target_update_rate
         require(0.0 < rate <= 1.0, "target_update_rate", "in (0, 1]", rate)
         require(len(self.hidden_sizes) >= 1, "hidden_sizes", "at least one", self.hidden_sizes)
@@ -99,6 +104,7 @@ class LearnerState:
       log_temperature: `[]`.
       policy_opt, q_opt, temperature_opt: optimiser states.
       obs_stats: running statistics of observations (unused without normalisation).
+      prior: pi_1, the policy to stay near; None where its weight is 0.
     """
 
     policy_params: Params
@@ -109,6 +115,7 @@ class LearnerState:
     q_opt: optax.OptState
     temperature_opt: optax.OptState
     obs_stats: running_statistics.RunningStatisticsState
+    prior: "PolicyParams | None" = None
 
 
 @struct.dataclass
@@ -220,6 +227,9 @@ def init(
         learner = learner.replace(
             policy_params=policy_params.policy, obs_stats=policy_params.obs_stats
         )
+        if config.prior_weight > 0.0:
+            # A copy: the state is donated, and two leaves must not share one buffer.
+            learner = learner.replace(prior=jax.tree.map(jnp.copy, policy_params))
     if start is None:
         start = jax.vmap(env.reset)(jax.random.split(key_env, config.num_envs))
     buffer = replay.init(config.buffer_capacity, obs_dim, action_dim)
@@ -350,13 +360,8 @@ def update(
         transitions,
         key_critic,
     )
-    actor_loss, policy_grads = jax.value_and_grad(networks.actor_loss)(
-        learner.policy_params,
-        learner.obs_stats,
-        learner.q_params,
-        temperature,
-        transitions,
-        key_actor,
+    actor_loss, policy_grads = jax.value_and_grad(_actor_loss)(
+        learner.policy_params, learner, networks, temperature, transitions, key_actor, config
     )
     q_updates, q_opt = networks.optimizer.update(q_grads, learner.q_opt)
     policy_updates, policy_opt = networks.optimizer.update(policy_grads, learner.policy_opt)
@@ -391,6 +396,22 @@ def update(
         "batch_reward": jnp.mean(batch.reward_t),
     }
     return learner, metrics
+
+
+def _actor_loss(policy_params, learner, networks, temperature, transitions, key, config):
+    loss = networks.actor_loss(
+        policy_params, learner.obs_stats, learner.q_params, temperature, transitions, key
+    )
+    if learner.prior is None:
+        return loss
+    policy_network = networks.sac.policy_network
+    distribution = networks.sac.parametric_action_distribution
+    obs_t, prior = transitions.observation, learner.prior
+    logits = policy_network.apply(learner.obs_stats, policy_params, obs_t)
+    unbounded_action_t = distribution.sample_no_postprocessing(logits, key)
+    logits_prior = policy_network.apply(prior.obs_stats, prior.policy, obs_t)
+    log_prior = distribution.log_prob(logits_prior, unbounded_action_t)
+    return loss - config.prior_weight * jnp.mean(log_prior)
 
 
 def learn(state: SacState, batches: Transition, config: SacConfig) -> tuple[SacState, Metrics]:

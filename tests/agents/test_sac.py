@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 
 import jax
@@ -215,3 +216,45 @@ def test_density_integrates_to_one():
 def test_config_refuses(setting):
     with pytest.raises(UsageError, match=next(iter(setting))):
         sac.SacConfig(**setting)
+
+
+def test_without_rewards_the_actor_returns_to_the_policy_it_started_from():
+    """On critics that say nothing, only -log pi_1 is left to minimise."""
+    config = dataclasses.replace(SMALL, prior_weight=1.0, initial_temperature=1e-4)
+    config = dataclasses.replace(config, normalize_observations=False, learn_temperature=False)
+    first = sac.init_learner(jax.random.PRNGKey(3), ENV.observation_size, ENV.action_size, config)
+    # pi_1 prefers an action far from where the actor begins.
+    bias = jnp.zeros(2 * ENV.action_size).at[: ENV.action_size].set(1.0)
+    shifted = jax.tree_util.tree_map_with_path(
+        lambda path, x: x + bias if x.shape == bias.shape else x, first.policy_params
+    )
+    prior = sac.policy_of(first)._replace(policy=shifted)
+    state = sac.init(KEY, ENV, config, policy_params=prior)
+    assert state.learner.prior is not None
+    learner = state.learner.replace(
+        policy_params=first.policy_params, q_params=jax.tree.map(jnp.zeros_like, first.q_params)
+    )
+    state = state.replace(learner=learner.replace(target_q_params=learner.q_params))
+    _, batches = sac.draw(state, ENV, config)
+    batch = jax.tree.map(lambda x: x[0], batches)
+    batch = batch._replace(reward_t=jnp.zeros_like(batch.reward_t))
+    frozen = state.learner.q_params
+
+    @jax.jit
+    def update(learner, key):
+        learner, _ = sac.update(learner, batch, key, config)
+        return learner.replace(q_params=frozen, target_q_params=frozen), None
+
+    def distance(learner):
+        act = functools.partial(sac.act, key=KEY, config=config, action_dim=ENV.action_size)
+        own = act(sac.policy_of(learner), batch.obs_t, deterministic=True)
+        return float(jnp.abs(own - act(prior, batch.obs_t, deterministic=True)).mean())
+
+    before = distance(state.learner)
+    after, _ = jax.lax.scan(update, state.learner, jax.random.split(KEY, 1_500))
+    assert before > 0.3 and distance(after) < 0.3 * before
+
+
+def test_without_a_weight_no_prior_is_kept():
+    first = sac.policy_of(sac.init_learner(KEY, ENV.observation_size, ENV.action_size, SMALL))
+    assert sac.init(KEY, ENV, SMALL, policy_params=first).learner.prior is None
