@@ -89,7 +89,7 @@ DOMAINS: dict[str, tuple[str, ...]] = {
         # levels below, and that one level sets the lower end of the curve's scale.
         "noise.num_levels=17",
         # Left to itself SAC turns somersaults, 23 deviations away from anything rolled out.
-        "policies.sac.prior_weight=0.1",
+        "policies.sac.prior_weight=0.2",
     ),
 }
 
