@@ -86,15 +86,22 @@ class Population:
         """Takes the states of a population apart."""
         if self.mode == "threads":
             return list(states)
-        leaves, structure = jax.tree.flatten(states)
-        axes = jax.tree.broadcast(self._axes_of(states), states, is_leaf=lambda axis: axis is None)
-        axes = jax.tree.leaves(axes, is_leaf=lambda axis: axis is None)
-        return [
-            structure.unflatten(
-                [leaf if axis is None else leaf[i] for leaf, axis in zip(leaves, axes, strict=True)]
-            )
-            for i in range(len(self.inputs))
-        ]
+
+        def absent(leaf):
+            return leaf is None
+
+        # Axes may be absent, and so may parts of the state: both count as leaves.
+        leaves, structure = jax.tree.flatten(states, is_leaf=absent)
+        axes = jax.tree.broadcast(self._axes_of(states), states, is_leaf=absent)
+        axes = jax.tree.leaves(axes, is_leaf=absent)
+
+        def member(i):
+            return [
+                leaf if axis is None or leaf is None else leaf[i]
+                for leaf, axis in zip(leaves, axes, strict=True)
+            ]
+
+        return [structure.unflatten(member(i)) for i in range(len(self.inputs))]
 
 
 def stack(members: Sequence[Any]) -> Any:

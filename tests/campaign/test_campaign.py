@@ -66,7 +66,13 @@ def test_what_was_done_is_not_done_again(campaign):
 def test_every_method_is_recorded_once(campaign):
     out, _, _ = campaign
     records = _records(out)
-    assert {record["method"] for record in records} == {"represent", "ssrr", "msrd", "drex"}
+    assert {record["method"] for record in records} == {
+        "represent",
+        "ssrr",
+        "msrd",
+        "drex",
+        "airl",
+    }
     names = ("domain", "method", "target", "quantity", "seed", "config_hash")
     told = [tuple(record[name] for name in names) for record in records]
     assert len(set(told)) == len(told)
