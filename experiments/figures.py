@@ -6,6 +6,7 @@ python -m experiments.figures --campaign=runs/campaign --out=results/figures
 """
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from represent_jax.campaign.entries import Entry, entries
 from represent_jax.campaign.variants import DOMAINS
 from represent_jax.errors import RepresentError
 from represent_jax.report import figures
+from represent_jax.runs import RunDirectory
 from represent_jax.runs.graph import Graph
 
 _CAMPAIGN = flags.DEFINE_string("campaign", "runs/campaign", "Folder of the campaign.")
@@ -61,24 +63,27 @@ def main(argv: list[str]) -> None:
     print("\n".join(written))
 
 
+def _done(graph: Graph, runs: list[Entry], stage: str) -> Iterator[tuple[Entry, RunDirectory]]:
+    """Yields the runs whose stage is done, each with the stage's folder."""
+    for run in runs:
+        node = run.reports[stage]
+        if graph.is_done(node):
+            yield run, graph.directory(node)
+
+
 def _curves(graph: Graph, runs: list[Entry]) -> dict:
     found = {}
-    for run in runs:
-        node = run.reports["reward_evaluation"]
-        if graph.is_done(node):
-            curves = graph.directory(node).load_findings("reward_evaluation")["curve"]
-            found |= dict(zip(run.config.group_names, curves, strict=True))
+    for run, directory in _done(graph, runs, "reward_evaluation"):
+        curves = directory.load_findings("reward_evaluation")["curve"]
+        found |= dict(zip(run.config.group_names, curves, strict=True))
     return found
 
 
 def _points(graph: Graph, runs: list[Entry]) -> dict:
     """By target and group of trajectories, true and learned returns."""
     found: dict[str, dict] = {}
-    for run in runs:
-        node = run.reports["reward_evaluation"]
-        if not graph.is_done(node):
-            continue
-        arrays = graph.directory(node).load_arrays("scatter")
+    for run, directory in _done(graph, runs, "reward_evaluation"):
+        arrays = directory.load_arrays("scatter")
         for target in run.config.target_names:
             groups = {key.split("/")[1] for key in arrays if key.startswith(f"{target}/")}
             found[target] = {
@@ -91,11 +96,8 @@ def _points(graph: Graph, runs: list[Entry]) -> dict:
 def _paths(graph: Graph, runs: list[Entry]) -> dict:
     """By target and method, the learning curve of every seed."""
     found: dict[str, dict[str, list[tuple[np.ndarray, np.ndarray]]]] = {}
-    for run in runs:
-        node = run.reports["policy_evaluation"]
-        if not graph.is_done(node):
-            continue
-        arrays = graph.directory(node).load_arrays("learning_curves")
+    for run, directory in _done(graph, runs, "policy_evaluation"):
+        arrays = directory.load_arrays("learning_curves")
         for target in run.config.target_names:
             path = (arrays[f"{target}/env_steps"], arrays[f"{target}/true_return"])
             found.setdefault(target, {}).setdefault(run.variant, []).append(path)

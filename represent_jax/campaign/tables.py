@@ -145,44 +145,33 @@ def three_strategies(select: Select) -> list[Cell]:
     return cells
 
 
-def further_ablations(select: Select) -> list[Cell]:
-    """Where the gain comes from: rewards without parts of the method."""
+def _grid(
+    select: Select, domains: Sequence[str], methods: Sequence[str], quantities: Sequence[str]
+) -> list[Cell]:
+    """Every quantity of every method, target and domain."""
     return [
         select.cell(domain, target, method, quantity)
-        for domain in DOMAINS
+        for domain in domains
         for target in _TARGETS
-        for method in (
-            "represent",
-            "no_reg",
-            "no_bcd",
-            "shared",
-            "no_sigmoid",
-            "ensemble_1",
-            "literal_bcd",
-        )
-        for quantity in ("pearson_pooled", "pearson_test")
+        for method in methods
+        for quantity in quantities
     ]
+
+
+def further_ablations(select: Select) -> list[Cell]:
+    """Where the gain comes from: rewards without parts of the method."""
+    return _grid(select, DOMAINS, ("represent", *ABLATIONS), ("pearson_pooled", "pearson_test"))
 
 
 def cold_starts(select: Select) -> list[Cell]:
     """What starting from Phase 1's policies does."""
-    return [
-        select.cell(domain, target, method, quantity)
-        for domain in DOMAINS
-        for target in _TARGETS
-        for method in ("represent", "cold")
-        for quantity in _RETURNS
-    ]
+    return _grid(select, DOMAINS, ("represent", "cold"), _RETURNS)
 
 
 def speeds(select: Select) -> list[Cell]:
     """Figure 5 in numbers: env steps after which 90 % of the last return was first reached."""
-    return [
-        select.cell("inverted_double_pendulum", target, method, quantity)
-        for target in _TARGETS
-        for method in ("scratch", "ssrr_scratch")
-        for quantity in ("env_steps_to_90_percent", "return_last")
-    ]
+    quantities = ("env_steps_to_90_percent", "return_last")
+    return _grid(select, ("inverted_double_pendulum",), ("scratch", "ssrr_scratch"), quantities)
 
 
 TABLES: dict[str, tuple[str, Callable[[Select], list[Cell]]]] = {

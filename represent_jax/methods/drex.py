@@ -152,13 +152,6 @@ def load_rewards(
     return _rewards_of(config, params)
 
 
-def load_policies(
-    config: DrexConfig, env: Environment, directory: RunDirectory
-) -> dict[str, Callable[[jax.Array], jax.Array]]:
-    """The policy of a run, by its only target."""
-    return policy_learning.load(config.policies, config.target_names, env, directory)
-
-
 def _reward_fn(config: DrexConfig) -> RewardFn:
     def reward_fn(params, obs_t, action_t, next_obs_t):
         return preference.reward(params, obs_t, action_t, next_obs_t, config.preference)

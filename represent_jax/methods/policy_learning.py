@@ -8,6 +8,7 @@ import numpy as np
 
 from represent_jax.agents.sac import PolicyParams
 from represent_jax.envs import Environment, Episode
+from represent_jax.methods.config import MethodConfig
 from represent_jax.methods.pipeline import numbers, shape_like
 from represent_jax.methods.population import Population, stack
 from represent_jax.runs import RunDirectory
@@ -110,12 +111,13 @@ def best_start(
 
 
 def load(
-    config: PoliciesConfig, names: Sequence[str], env: Environment, directory: RunDirectory
+    config: MethodConfig, env: Environment, directory: RunDirectory
 ) -> dict[str, Callable[[jax.Array], jax.Array]]:
-    """What `run` saved, as deterministic functions of observations, by name."""
-    agent, settings = policies.agent_of(config)
+    """The policies of a run of any method that has `policies`, by target; they take modes."""
+    agent, settings = policies.agent_of(config.policies)
+    names = config.target_names
     key, action_dim = jax.random.PRNGKey(0), env.action_size
-    example = jax.eval_shape(lambda key: _random_policy(key, env, config), key)
+    example = jax.eval_shape(lambda key: _random_policy(key, env, config.policies), key)
     stacked = directory.load_output(
         "policies", jax.tree.map(lambda x: shape_like(x, len(names)), example)
     )

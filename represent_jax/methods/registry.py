@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 
 from represent_jax.errors import unknown
-from represent_jax.methods import cloning, drex, msrd, represent, ssrr
+from represent_jax.methods import cloning, drex, msrd, policy_learning, represent, ssrr
 from represent_jax.methods.config import MethodConfig, RepresentConfig
 from represent_jax.methods.plan import Stage
 
@@ -40,20 +40,20 @@ METHODS: dict[str, Method] = {
         config=RepresentConfig,
         plan=represent.plan,
         load_rewards=represent.load_rewards,
-        load_policies=represent.load_policies,
+        load_policies=policy_learning.load,
     ),
     "ssrr": Method(
         config=ssrr.SsrrConfig,
         plan=ssrr.plan,
         load_rewards=ssrr.load_rewards,
-        load_policies=ssrr.load_policies,
+        load_policies=policy_learning.load,
         configure=ssrr.configure,
     ),
     "drex": Method(
         config=drex.DrexConfig,
         plan=drex.plan,
         load_rewards=drex.load_rewards,
-        load_policies=drex.load_policies,
+        load_policies=policy_learning.load,
         configure=drex.configure,
     ),
     "msrd": Method(

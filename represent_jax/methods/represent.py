@@ -146,13 +146,6 @@ def load_rewards(
     return rewards_of(config, directory.load_output("regression", example.rewards))
 
 
-def load_policies(
-    config: RepresentConfig, env: Environment, directory: RunDirectory
-) -> dict[str, Callable[[jax.Array], jax.Array]]:
-    """The policies of a run, by target."""
-    return policy_learning.load(config.policies, config.target_names, env, directory)
-
-
 def _views(config: RepresentConfig, rewards: regression.Rewards) -> dict[str, regression.View]:
     return {
         name: regression.view(rewards, i - 1 if i else None, config.regression)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from represent_jax.config import require
 from represent_jax.envs import Environment
-from represent_jax.methods import pipeline, policy_learning, represent
+from represent_jax.methods import pipeline, represent
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.plan import Stage
 from represent_jax.runs import RunDirectory
@@ -91,13 +91,6 @@ def load_rewards(
         jax.vmap(lambda key: regression.init(key, *sizes, config.regression).rewards), keys
     )
     return _rewards_of(config, directory.load_output("regression", example))
-
-
-def load_policies(
-    config: SsrrConfig, env: Environment, directory: RunDirectory
-) -> dict[str, Callable[[jax.Array], jax.Array]]:
-    """The policies of a run, by target."""
-    return policy_learning.load(config.policies, config.target_names, env, directory)
 
 
 def _by_target(config: SsrrConfig, rewards: regression.Rewards) -> dict[str, regression.Rewards]:
