@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from represent_jax.envs.keyboard import DirectKeyboard
 from represent_jax.envs.task import Task, load_gymnasium_model
 from represent_jax.physics.engine import PhysicsState
 from represent_jax.physics.mjx import MjxSolver
@@ -55,6 +56,13 @@ class InvertedDoublePendulum(Task):
     def terminated(self, physics: PhysicsState) -> jax.Array:
         _, tip_height = _tip(physics)
         return tip_height <= 1.0
+
+    def keyboard(self, model: mujoco.MjModel) -> DirectKeyboard:
+        pushes = (
+            ("arrowleft", "push the cart to the left", 0, -0.5),
+            ("arrowright", "push the cart to the right", 0, 0.5),
+        )
+        return DirectKeyboard(model.nu, pushes)
 
 
 def _tip(physics: PhysicsState) -> tuple[jax.Array, jax.Array]:

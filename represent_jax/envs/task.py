@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from represent_jax.envs.keyboard import Keyboard
 from represent_jax.physics.engine import PhysicsState
 from represent_jax.physics.mjx import MjxSolver
 
@@ -63,6 +64,11 @@ class Task(abc.ABC):
         """Returns whether the episode has failed or succeeded for good, `[]` bool."""
         del physics
         return jnp.zeros((), bool)
+
+    def keyboard(self, model: mujoco.MjModel) -> Keyboard | None:
+        """Returns the keys that drive the robot; None where it can only be watched."""
+        del model
+        return None
 
 
 def load_gymnasium_model(file_name: str) -> mujoco.MjModel:
