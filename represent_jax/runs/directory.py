@@ -7,7 +7,7 @@ checkpoints/<stage>  `output` once the stage is done, `progress/<step>` until th
 arrays/<name>.npz    plot data
 findings/<stage>.json what a stage found
 results.json         what the run found
-figures/ report.html
+figures/ videos/ report.html
 """
 
 import json
@@ -65,6 +65,11 @@ class RunDirectory:
     def figures(self) -> Path:
         """Folder of the figures."""
         return self.path / "figures"
+
+    @property
+    def videos(self) -> Path:
+        """Folder of the videos."""
+        return self.path / "videos"
 
     def is_done(self, stage: str) -> bool:
         """Returns whether the stage's output is saved."""
