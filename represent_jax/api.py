@@ -7,11 +7,13 @@ import jax
 import jax.numpy as jnp
 
 from represent_jax import config as configs
+from represent_jax.data.trajectories import Demonstrations
 from represent_jax.envs import make_env
 from represent_jax.errors import unknown
 from represent_jax.methods.config import MethodConfig
 from represent_jax.methods.registry import find_method
 from represent_jax.runs import RunDirectory, load_config_json
+from represent_jax.stages import strategies
 
 
 def load_config(run_dir: str | os.PathLike) -> MethodConfig:
@@ -22,6 +24,28 @@ def load_config(run_dir: str | os.PathLike) -> MethodConfig:
     """
     stored = load_config_json(run_dir)
     return configs.from_dict(find_method(stored.get("method", "represent")).config, stored)
+
+
+def infer_strategies(
+    demonstrations: Demonstrations, num_strategies: int = 0, seed: int = 0
+) -> Demonstrations:
+    """Labels demonstrations by strategy; the labels that they carry are not looked at.
+
+    Args:
+      demonstrations: the pool.
+      num_strategies: how many strategies there are; 0 if that is to be found out.
+      seed: seed of the random features and of the resamples.
+
+    Returns:
+      The same demonstrations with strategies numbered by first appearance; the metadata holds the
+      confidence of each trajectory's label, under "inferred_strategies".
+
+    Raises:
+      RepresentError: a trajectory is too short to tell.
+    """
+    config = strategies.StrategiesConfig(num_strategies=num_strategies)
+    found = strategies.infer(jax.random.PRNGKey(seed), demonstrations.trajectories, config)
+    return strategies.label(demonstrations, found)
 
 
 def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
