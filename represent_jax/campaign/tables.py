@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from represent_jax.campaign import paper
 from represent_jax.campaign.statistics import Aggregate, aggregate
-from represent_jax.campaign.variants import ABLATIONS, DOMAINS
+from represent_jax.campaign.variants import ABLATIONS, DOMAINS, NUMS_STRATEGIES
 from represent_jax.errors import RepresentError, unknown
 from represent_jax.report.tables import Table
 from represent_jax.report.values import display_name, format_number
@@ -35,6 +35,8 @@ METHOD_NAMES = {
     "scratch": "REPRESENT",
     "ssrr_scratch": "SSRR",
     "three_strategies": "REPRESENT",
+    "strategies_1": "1 strategy",
+    **{f"strategies_{num}": f"{num} strategies" for num in NUMS_STRATEGIES if num > 1},
 }
 _TARGETS = ("task", "strategy_1", "strategy_2")
 _RETURNS = ("return_best", "return_final")
@@ -145,6 +147,15 @@ def three_strategies(select: Select) -> list[Cell]:
     return cells
 
 
+def growing_strategies(select: Select) -> list[Cell]:
+    """One step past the paper: what the task reward gains from more demonstrators."""
+    return [
+        select.cell("half_cheetah", "task", f"strategies_{num}", quantity)
+        for num in NUMS_STRATEGIES
+        for quantity in ("pearson_pooled", "pearson_test", *_RETURNS)
+    ]
+
+
 def _grid(
     select: Select, domains: Sequence[str], methods: Sequence[str], quantities: Sequence[str]
 ) -> list[Cell]:
@@ -179,6 +190,7 @@ TABLES: dict[str, tuple[str, Callable[[Select], list[Cell]]]] = {
     "2": ("Table II. True return of policies", returns),
     "3": ("Table III. Hopper without one of the losses: true return of policies", ablations),
     "5": ("Table V. Three strategies on HalfCheetah", three_strategies),
+    "strategies": ("HalfCheetah with more and more demonstrators", growing_strategies),
     "ablations": ("Where the gain comes from", further_ablations),
     "figure_5": ("Figure 5. How fast policies learn from random networks", speeds),
     "cold": ("Policies from Phase 1's and from random networks: true return", cold_starts),
