@@ -111,7 +111,10 @@ def _read_folder(path: str | os.PathLike) -> tuple[str | None, list[dict[str, An
 
 
 def _row(row: Mapping[str, Any]) -> dict[str, Any]:
-    infos = json.loads(row["infos"][-1]) if row["infos"] else {}
+    try:
+        infos = json.loads(row["infos"][-1]) if row["infos"] else {}
+    except ValueError:
+        infos = {}
     return {
         "obs": np.asarray(row["obs"]),
         "acts": np.asarray(row["acts"]),

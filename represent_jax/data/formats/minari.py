@@ -38,24 +38,19 @@ def read(dataset: str | os.PathLike, env_name: str = "") -> Demonstrations:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            folder = Path(dataset)
-            if folder.is_dir():
-                held = minari.MinariDataset(
-                    folder / "data" if (folder / "data").is_dir() else folder
-                )
-            else:
-                held = minari.load_dataset(str(dataset))
+            held = _open(minari, dataset)
+            for name in ("observation", "action"):
+                _require_vectors(f"{dataset}: {name}s", getattr(held, f"{name}_space"))
+            episodes = list(held)
+            metadata = list(held.storage.get_episode_metadata(held.episode_indices))
     except FileNotFoundError as error:
         raise RepresentError(
             f"{dataset}: no such dataset here; `minari download {dataset}` fetches a public one"
         ) from error
-    except (ValueError, AssertionError, TypeError, OSError, ImportError) as error:
+    except (ValueError, AssertionError, TypeError, KeyError, OSError, ImportError) as error:
         raise RepresentError(f"{dataset}: not a dataset that can be read: {error}") from error
-    for name, space in (("observations", held.observation_space), ("actions", held.action_space)):
-        _require_vectors(dataset, name, space)
-    metadata = list(held.storage.get_episode_metadata(held.episode_indices))
     trajectories, notes = [], []
-    for i, (episode, extra) in enumerate(zip(held, metadata, strict=True)):
+    for i, (episode, extra) in enumerate(zip(episodes, metadata, strict=True)):
         try:
             trajectories.append(_trajectory(episode, int(extra.get(_STRATEGY, 0))))
         except RepresentError as error:
@@ -113,11 +108,18 @@ def write(dataset: str | os.PathLike, demonstrations: Demonstrations) -> None:
     made.storage.update_metadata({OWN_KEY: describe(demonstrations)})
 
 
-def _require_vectors(dataset: str | os.PathLike, name: str, space: gym.Space) -> None:
+def _open(minari: Any, dataset: str | os.PathLike) -> Any:
+    folder = Path(dataset)
+    if not folder.is_dir():
+        return minari.load_dataset(str(dataset))
+    return minari.MinariDataset(folder / "data" if (folder / "data").is_dir() else folder)
+
+
+def _require_vectors(what: str, space: gym.Space) -> None:
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         keys = f" of {', '.join(space.spaces)}" if isinstance(space, gym.spaces.Dict) else ""
         raise RepresentError(
-            f"{dataset}: {name} are a {type(space).__name__}{keys} of shape {space.shape}, "
+            f"{what} are a {type(space).__name__}{keys} of shape {space.shape}, "
             "expected a Box of one axis"
         )
 
