@@ -54,7 +54,8 @@ def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
     Returns:
       `reward(obs_t, action_t, next_obs_t, target="task")`, which takes NumPy or JAX arrays of
       shape `[..., dim]` and returns `[...]`; `target` is "task" (R^0), or "strategy_1" (R^1) and
-      so on. It can be called under the caller's own jit and vmap.
+      so on. It can be called under the caller's own jit and vmap. Actions may be None unless the
+      reward was made to see them.
 
     Raises:
       RepresentError: the run has not finished its reward learning, or its method learns none.
@@ -67,7 +68,8 @@ def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
     def reward(obs_t, action_t, next_obs_t, target: str = "task") -> jax.Array:
         if target not in rewards:
             raise unknown("target", target, rewards)
-        return rewards[target](*(jnp.asarray(x) for x in (obs_t, action_t, next_obs_t)))
+        rows = (obs_t, action_t, next_obs_t)
+        return rewards[target](*(None if x is None else jnp.asarray(x) for x in rows))
 
     return reward
 
