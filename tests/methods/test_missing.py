@@ -155,10 +155,9 @@ def test_states_alone_of_a_robot_of_ones_own(tmp_path):
 @pytest.fixture
 def quick_compilation():
     """Programs that run once: their time is the compiler's."""
-    before = jax.config.jax_disable_most_optimizations
     jax.config.update("jax_disable_most_optimizations", True)
     yield
-    jax.config.update("jax_disable_most_optimizations", before)
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.mark.usefixtures("quick_compilation")
