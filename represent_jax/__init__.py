@@ -15,9 +15,17 @@ _HOME = {
     "load_config": "represent_jax.api",
     "load_reward": "represent_jax.api",
     "load_policy": "represent_jax.api",
+    "infer_strategies": "represent_jax.api",
 }
 
-__all__ = ["load_config", "load_demonstrations", "load_policy", "load_reward", "make_env"]
+__all__ = [
+    "infer_strategies",
+    "load_config",
+    "load_demonstrations",
+    "load_policy",
+    "load_reward",
+    "make_env",
+]
 
 
 def __getattr__(name: str) -> Any:
