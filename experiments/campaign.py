@@ -8,6 +8,7 @@ them, found again by the hash of what they depend on.
 """
 
 import time
+from pathlib import Path
 
 from absl import flags
 
@@ -17,6 +18,7 @@ from represent_jax.campaign.variants import DOMAINS, TABLES
 from represent_jax.errors import RepresentError
 from represent_jax.report.values import format_duration
 from represent_jax.runs.graph import BLOCKED, FAILED, Graph, Node
+from represent_jax.runs.tracking import WandbTracker
 
 _TABLES = flags.DEFINE_list("tables", ["1", "2", "3", "5"], f"Of {', '.join(TABLES)}.")
 _DOMAINS = flags.DEFINE_list("domains", list(DOMAINS), "Environments.")
@@ -27,6 +29,9 @@ _PRESET = flags.DEFINE_string("preset", "paper", "Settings to begin with: smoke,
 _OUT = flags.DEFINE_string("out", "runs/campaign", "Folder of the campaign.")
 _RECORD = flags.DEFINE_string("record", None, "File of records; <out>/records.jsonl if not given.")
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting of every run that has it.")
+_WANDB = flags.DEFINE_string(
+    "wandb", None, "Project of Weights & Biases to log to (extra `wandb`)."
+)
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Show what is done and left, and run nothing.")
 
 
@@ -36,7 +41,8 @@ def main(argv: list[str]) -> None:
     every = entries(
         _TABLES.value, _DOMAINS.value, seeds, _PRESET.value, _OVERRIDE.value, _VARIANTS.value
     )
-    graph = Graph((node for entry in every for node in entry.reports.values()), _OUT.value)
+    wanted = (node for entry in every for node in entry.reports.values())
+    graph = Graph(wanted, _OUT.value, _track if _WANDB.value else None)
     records = _RECORD.value or f"{_OUT.value}/records.jsonl"
     print(f"{len(every)} runs, {len(graph.nodes)} stages, {len(graph.left)} of them left")
     if _DRY_RUN.value:
@@ -68,6 +74,10 @@ def main(argv: list[str]) -> None:
             f"{node.name} ({graph.errors[node.hash]})" for node in bad if node.hash in graph.errors
         ]
         raise RepresentError(f"{len(bad)} stages are not done; failed: {'; '.join(failed)}")
+
+
+def _track(node: Node, folder: Path) -> WandbTracker:
+    return WandbTracker(_WANDB.value, folder, node.name, node.settings, group=_OUT.value)
 
 
 if __name__ == "__main__":

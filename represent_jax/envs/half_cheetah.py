@@ -34,5 +34,6 @@ class HalfCheetah(Task):
         forward_velocity = (after.qpos[0] - before.qpos[0]) / dt
         return forward_velocity - 0.1 * jnp.sum(jnp.square(action_t))
 
-    def qpos_of(self, obs: np.ndarray, dt: float) -> np.ndarray:
+    def qpos_of(self, model: mujoco.MjModel, obs: np.ndarray, dt: float) -> np.ndarray:
+        del model
         return qpos_along_track(obs, dt)

@@ -44,7 +44,8 @@ class Hopper(Task):
     def terminated(self, physics: PhysicsState) -> jax.Array:
         return ~_is_healthy(physics)
 
-    def qpos_of(self, obs: np.ndarray, dt: float) -> np.ndarray:
+    def qpos_of(self, model: mujoco.MjModel, obs: np.ndarray, dt: float) -> np.ndarray:
+        del model
         return qpos_along_track(obs, dt)
 
 

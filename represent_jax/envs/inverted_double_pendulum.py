@@ -58,8 +58,8 @@ class InvertedDoublePendulum(Task):
         _, tip_height = _tip(physics)
         return tip_height <= 1.0
 
-    def qpos_of(self, obs: np.ndarray, dt: float) -> np.ndarray:
-        del dt
+    def qpos_of(self, model: mujoco.MjModel, obs: np.ndarray, dt: float) -> np.ndarray:
+        del model, dt
         return np.column_stack([obs[:, 0], np.arctan2(obs[:, 1:3], obs[:, 3:5])])
 
     def keyboard(self, model: mujoco.MjModel) -> DirectKeyboard:

@@ -99,19 +99,20 @@ class Task(abc.ABC):
         del obs
         return {}
 
-    def qpos_of(self, obs: np.ndarray, dt: float) -> np.ndarray | None:
+    def qpos_of(self, model: mujoco.MjModel, obs: np.ndarray, dt: float) -> np.ndarray | None:
         """Returns the positions behind an episode's observations; None where they do not tell.
 
         Demonstrations hold observations alone; this is what lets a video show them.
 
         Args:
+          model: the scene they are to be shown in.
           obs: observations of successive steps, `[T, obs_dim]`.
           dt: seconds between two of them.
 
         Returns:
           Positions `[T, nq]`; a place that observations leave out begins at 0.
         """
-        del obs, dt
+        del model, obs, dt
         return None
 
     def keyboard(self, model: mujoco.MjModel) -> Keyboard | None:

@@ -164,12 +164,13 @@ def _demonstrated(
     found = {}
     for i, name in enumerate(group_names):
         trajectory = demonstrations.of_strategy(i)[0]
-        qpos = env.task.qpos_of(trajectory.obs, env.engine.dt)
+        qpos = env.task.qpos_of(env.engine.model, trajectory.obs, env.engine.dt)
         if qpos is None:
             reason = "which positions its observations stand for (Task.qpos_of)"
             return {}, [f"Policies alone are shown: {env.name} does not say {reason}."]
         title = "Demonstrator" if name == "merged" else f"Demonstrator of {display_name(name)}"
-        found[name] = (Panel(title, trajectory.total_reward), qpos)
+        true_return = None if trajectory.rewards is None else trajectory.total_reward
+        found[name] = (Panel(title, true_return), qpos)
     return found, []
 
 
