@@ -203,7 +203,7 @@ def judge_policies(
     log: Sequence[Mapping[str, Any]],
     directory: RunDirectory,
 ) -> dict[str, Any]:
-    """True return, learned return and style of policies; saves their learning curves.
+    """True return, learned return, style and the task's outcomes; saves learning curves.
 
     Args:
       key: PRNG key.
@@ -249,6 +249,10 @@ def judge_policies(
             "demonstrators_return": base,
             "ratio_to_demonstrators": final / base,
             "style_kept": None if group is None else float(shares[group]),
+            **{
+                quantity: float(np.mean(values))
+                for quantity, values in problem.env.unwrapped.task.outcomes(batch.obs).items()
+            },
         }
     if log:
         directory.save_arrays("learning_curves", curves)
