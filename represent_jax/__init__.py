@@ -17,17 +17,22 @@ _HOME = {
     "load_policy": "represent_jax.api",
 }
 
+# Learned rewards in the interfaces of other libraries.
+_MODULES = ("brax", "gymnasium")
+
 __all__ = ["load_config", "load_demonstrations", "load_policy", "load_reward", "make_env"]
 
 
 def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return importlib.import_module(f"{__name__}.{name}")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_HOME[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME})
+    return sorted({*globals(), *_HOME, *_MODULES})
 
 
 with contextlib.redirect_stdout(io.StringIO()):

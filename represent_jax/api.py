@@ -48,6 +48,38 @@ def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
     return reward
 
 
+def load_reward_for(
+    run_dir: str | os.PathLike, target: str, observation_size: int, action_size: int
+) -> Callable[..., jax.Array]:
+    """Loads one of a run's rewards for an environment that was made elsewhere.
+
+    Args:
+      run_dir: folder of the run.
+      target: "task", or "strategy_1" and so on.
+      observation_size: entries of that environment's observations.
+      action_size: entries of its actions.
+
+    Returns:
+      `reward(obs_t, action_t, next_obs_t)`, for actions in [-1, 1]; see `load_reward`.
+
+    Raises:
+      RepresentError: the run has not finished its reward learning, or its method learns none.
+      UsageError: no target of that name, or the run's environment has other sizes.
+    """
+    config = load_config(run_dir)
+    env = make_env(config.env, config.backend)
+    for field, expected, found in (
+        ("observation size", env.observation_size, observation_size),
+        ("action size", env.action_size, action_size),
+    ):
+        in_run = f"{expected}, that of {config.env} in {run_dir}"
+        configs.require(found == expected, field, in_run, found)
+    rewards = find_method(config.method).load_rewards(config, env, RunDirectory(run_dir))
+    if target not in rewards:
+        raise unknown("target", target, rewards)
+    return rewards[target]
+
+
 def load_policy(
     run_dir: str | os.PathLike, target: str = "task"
 ) -> Callable[[jax.Array], jax.Array]:
