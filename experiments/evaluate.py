@@ -47,6 +47,9 @@ def main(argv: list[str]) -> None:
     batch = pad(data.trajectories, max(t.length for t in data.trajectories))
     targets = config.target_names
     has_policies = RunDirectory(_RUN.value).is_done("policies")
+    columns = ("target", "Pearson", "Spearman")
+    if has_policies:
+        columns += ("true return", "std", "learned return", "std")
     rows = []
     for target in targets:
 
@@ -56,7 +59,7 @@ def main(argv: list[str]) -> None:
         returns = rollout.learned_returns(batch, learned, None)
         found = evaluation.correlate(rollout.true_returns(batch), returns)
         row = [display_name(target), *(format_number(float(x), 3) for x in found)]
-        if has_policies:
+        if has_policies and target in config.policy_names:
             policy = load_policy(_RUN.value, target)
             episodes = jax.jit(
                 lambda key, policy=policy: rollout.rollout(
@@ -72,10 +75,7 @@ def main(argv: list[str]) -> None:
                 rollout.learned_returns(episodes, learned, None),
             ):
                 row += [format_number(float(np.mean(values))), format_number(float(np.std(values)))]
-        rows.append(tuple(row))
-    columns = ("target", "Pearson", "Spearman")
-    if has_policies:
-        columns += ("true return", "std", "learned return", "std")
+        rows.append((*row, *["-"] * (len(columns) - len(row))))
     table = tables.Table(
         title=f"{len(data.trajectories)} trajectories, {_EPISODES.value} episodes of each policy",
         columns=columns,

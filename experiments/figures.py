@@ -98,7 +98,7 @@ def _paths(graph: Graph, runs: list[Entry]) -> dict:
     found: dict[str, dict[str, list[tuple[np.ndarray, np.ndarray]]]] = {}
     for run, directory in _done(graph, runs, "policy_evaluation"):
         arrays = directory.load_arrays("learning_curves")
-        for target in run.config.target_names:
+        for target in run.config.policy_names:
             path = (arrays[f"{target}/env_steps"], arrays[f"{target}/true_return"])
             found.setdefault(target, {}).setdefault(run.variant, []).append(path)
     return found

@@ -97,8 +97,8 @@ def load_policy(
       UsageError: no target of that name.
     """
     config = load_config(run_dir)
-    if target not in config.target_names:
-        raise unknown("target", target, config.target_names)
+    if target not in config.policy_names:
+        raise unknown("target", target, config.policy_names)
     env = make_env(config.env, config.backend)
     policies = find_method(config.method).load_policies(config, env, RunDirectory(run_dir))
     if target not in policies:

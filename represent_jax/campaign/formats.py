@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 
-from represent_jax.campaign.tables import Cell, to_table
+from represent_jax.campaign.tables import Cell, to_grids, to_table
 from represent_jax.errors import unknown
 from represent_jax.report.tables import Table, to_text
 
@@ -52,6 +52,7 @@ def _json(title: str, cells: Sequence[Cell]) -> str:
 FORMATS = {
     "text": lambda title, cells: to_text(to_table(title, cells)),
     "markdown": lambda title, cells: markdown(to_table(title, cells)),
+    "grid": lambda title, cells: "\n\n".join(map(markdown, to_grids(title, cells))),
     "latex": lambda title, cells: latex(to_table(title, cells)),
     "json": _json,
 }

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from represent_jax.campaign import paper
 from represent_jax.campaign.statistics import Aggregate, aggregate
-from represent_jax.campaign.variants import ABLATIONS, DOMAINS
+from represent_jax.campaign.variants import ABLATIONS, DOMAINS, NUMS_STRATEGIES
 from represent_jax.errors import RepresentError, unknown
 from represent_jax.report.tables import Table
 from represent_jax.report.values import display_name, format_number
@@ -35,6 +35,8 @@ METHOD_NAMES = {
     "scratch": "REPRESENT",
     "ssrr_scratch": "SSRR",
     "three_strategies": "REPRESENT",
+    "strategies_1": "1 strategy",
+    **{f"strategies_{num}": f"{num} strategies" for num in NUMS_STRATEGIES if num > 1},
 }
 _TARGETS = ("task", "strategy_1", "strategy_2")
 _RETURNS = ("return_best", "return_final")
@@ -145,6 +147,15 @@ def three_strategies(select: Select) -> list[Cell]:
     return cells
 
 
+def growing_strategies(select: Select) -> list[Cell]:
+    """One step past the paper: what the task reward gains from more demonstrators."""
+    return [
+        select.cell("half_cheetah", "task", f"strategies_{num}", quantity)
+        for num in NUMS_STRATEGIES
+        for quantity in ("pearson_pooled", "pearson_test", *_RETURNS)
+    ]
+
+
 def _grid(
     select: Select, domains: Sequence[str], methods: Sequence[str], quantities: Sequence[str]
 ) -> list[Cell]:
@@ -179,6 +190,7 @@ TABLES: dict[str, tuple[str, Callable[[Select], list[Cell]]]] = {
     "2": ("Table II. True return of policies", returns),
     "3": ("Table III. Hopper without one of the losses: true return of policies", ablations),
     "5": ("Table V. Three strategies on HalfCheetah", three_strategies),
+    "strategies": ("HalfCheetah with more and more demonstrators", growing_strategies),
     "ablations": ("Where the gain comes from", further_ablations),
     "figure_5": ("Figure 5. How fast policies learn from random networks", speeds),
     "cold": ("Policies from Phase 1's and from random networks: true return", cold_starts),
@@ -202,22 +214,20 @@ def make(name: str, records: Iterable[Mapping[str, Any]], preset: str) -> tuple[
 
 
 def to_table(title: str, cells: Sequence[Cell]) -> Table:
-    """The cells as text, a line for each."""
+    """The cells as text, a line for each with all that is known of it."""
     rows = []
     for cell in cells:
-        digits = 3 if cell.quantity.startswith("pearson") else 0
-        found = cell.found
-        published = cell.paper or ()
+        digits, found = _digits(cell), cell.found
         rows.append(
             (
-                f"{DOMAIN_NAMES[cell.domain]}, {display_name(cell.target).lower()}",
+                _row_name(cell),
                 METHOD_NAMES[cell.method],
                 _QUANTITY_NAMES[cell.quantity],
                 _plus_minus(found.mean, found.std, digits),
                 format_number(found.iqm, digits),
                 _interval(found.low, found.high, digits),
                 str(found.num),
-                _plus_minus(*published, digits=digits) if published else "-",
+                _plus_minus(*cell.paper, digits=digits) if cell.paper else "-",
             )
         )
     return Table(
@@ -235,6 +245,43 @@ def to_table(title: str, cells: Sequence[Cell]) -> Table:
         rows=tuple(rows),
         note="IQM: interquartile mean over seeds, with its bootstrap interval.",
     )
+
+
+def to_grids(title: str, cells: Sequence[Cell]) -> list[Table]:
+    """The cells at a glance: a table for each quantity, a column for each method."""
+    return [
+        _to_grid(title, quantity, [cell for cell in cells if cell.quantity == quantity])
+        for quantity in dict.fromkeys(cell.quantity for cell in cells)
+    ]
+
+
+def _to_grid(title: str, quantity: str, cells: Sequence[Cell]) -> Table:
+    methods = list(dict.fromkeys(cell.method for cell in cells))
+    shown: dict[str, dict[str, str]] = {}
+    for cell in cells:
+        digits = _digits(cell)
+        text = _plus_minus(cell.found.mean, cell.found.std, digits)
+        if cell.paper:
+            text += f" ({_plus_minus(*cell.paper, digits=digits)})"
+        shown.setdefault(_row_name(cell), {})[cell.method] = text
+    seeds = sorted({cell.found.num for cell in cells})
+    counted = f"{seeds[0]}" if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+    return Table(
+        title=f"{title}: {_QUANTITY_NAMES[quantity]}",
+        columns=("", *(METHOD_NAMES[method] for method in methods)),
+        rows=tuple(
+            (name, *(row.get(method, "-") for method in methods)) for name, row in shown.items()
+        ),
+        note=f"Mean +- standard deviation over seeds ({counted}); in brackets the paper's.",
+    )
+
+
+def _digits(cell: Cell) -> int:
+    return 3 if cell.quantity.startswith("pearson") else 0
+
+
+def _row_name(cell: Cell) -> str:
+    return f"{DOMAIN_NAMES[cell.domain]}, {display_name(cell.target).lower()}"
 
 
 _QUANTITY_NAMES = {

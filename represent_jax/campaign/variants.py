@@ -10,6 +10,9 @@ from represent_jax.methods.presets import make_config
 
 DOMAINS = ("hopper", "half_cheetah", "inverted_double_pendulum")
 
+# Of the eight demonstrators of HalfCheetah, how many are taken: the first ones.
+NUMS_STRATEGIES = (1, 2, 3, 5, 8)
+
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
@@ -67,6 +70,18 @@ VARIANTS = {
     "ssrr_scratch": Variant("ssrr_scratch", "ssrr", _FROM_SCRATCH),
     "ssrr_separate_scratch": Variant("ssrr_scratch", "ssrr", ("grouping=separate", *_FROM_SCRATCH)),
     "three_strategies": Variant("three_strategies", "represent", ("num_strategies=3",)),
+    **{
+        f"strategies_{num}": Variant(
+            f"strategies_{num}",
+            "represent",
+            (
+                "demonstrations=half_cheetah_8",
+                f"num_strategies={num}",
+                "policy_targets=task",
+            ),
+        )
+        for num in NUMS_STRATEGIES
+    },
 }
 
 ABLATIONS = ("no_reg", "no_bcd", "shared", "no_sigmoid", "ensemble_1", "literal_bcd")
@@ -96,6 +111,10 @@ TABLES = {
         dict.fromkeys(("represent", "no_reg", "no_bcd", "ssrr", "ssrr_separate"), _POLICIES),
     ),
     "5": TableRuns(("half_cheetah",), {"three_strategies": _POLICIES}),
+    "strategies": TableRuns(
+        ("half_cheetah",),
+        {f"strategies_{num}": _POLICIES for num in NUMS_STRATEGIES},
+    ),
     "ablations": TableRuns(DOMAINS, dict.fromkeys(("represent", *ABLATIONS), _REWARDS)),
     "figure_5": TableRuns(
         ("inverted_double_pendulum",),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from represent_jax.config import require
 from represent_jax.data.trajectories import Demonstrations, Trajectory
 from represent_jax.envs import Environment, Episode
-from represent_jax.errors import RepresentError
+from represent_jax.errors import RepresentError, unknown
 from represent_jax.stages import airl, policies
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.curve import CurveConfig
@@ -78,6 +78,11 @@ class MethodConfig:
         """Names of the rewards, or policies, that a run learns."""
         return (self.merged_name,)
 
+    @property
+    def policy_names(self) -> tuple[str, ...]:
+        """Names of the targets that a policy is trained for."""
+        return self.target_names
+
 
 @dataclasses.dataclass(frozen=True)
 class OneGroupConfig(MethodConfig):
@@ -97,9 +102,11 @@ class RepresentConfig(MethodConfig):
     """Settings of REPRESENT, and of SSRR on the same stages.
 
     Attributes:
+      policy_targets: targets that a policy is trained for; all if empty.
       airl, noise, curve, regression, policies: settings of the stages.
     """
 
+    policy_targets: tuple[str, ...] = ()
     airl: AirlConfig = AirlConfig()
     noise: NoiseConfig = NoiseConfig()
     curve: CurveConfig = CurveConfig()
@@ -108,6 +115,9 @@ class RepresentConfig(MethodConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in self.policy_targets:
+            if name not in self.target_names:
+                raise unknown("policy target", name, self.target_names)
         if self.policies.start == "phase1":
             _, settings = airl.generator(self.airl)
             require(
@@ -123,6 +133,12 @@ class RepresentConfig(MethodConfig):
         if self.regression.strategy_weight == 0.0:
             return (self.merged_name,)
         return ("task", *strategy_names(self.num_groups))
+
+    @property
+    def policy_names(self) -> tuple[str, ...]:
+        """The targets asked for, in the order of all."""
+        asked = self.policy_targets or self.target_names
+        return tuple(name for name in self.target_names if name in asked)
 
 
 class Problem(NamedTuple):

@@ -21,7 +21,7 @@ from represent_jax.errors import unknown
 from represent_jax.methods.clock import Clock
 from represent_jax.methods.config import MethodConfig, Problem
 from represent_jax.methods.results import describe
-from represent_jax.runs import RunDirectory
+from represent_jax.runs import RunDirectory, provenance
 from represent_jax.runs.graph import Node
 
 
@@ -50,12 +50,17 @@ def stage_key(seed: int, name: str) -> jax.Array:
 
 
 def run_stage(seed: int, stage: Stage, directory: RunDirectory, *inputs: Any) -> Any:
-    """Runs a stage, or returns what it reported where the directory holds that already."""
+    """Runs a stage, or returns what it reported where the directory holds that already.
+
+    What is reported carries the commit, the device and the versions that it was found with: a
+    campaign may be continued, and recorded, by another.
+    """
     key = stage_key(seed, stage.name)
     if not stage.reports:
         return stage.run(key, directory, *inputs)
     if not directory.has_findings(stage.name):
-        directory.save_findings(stage.name, stage.run(key, directory, *inputs))
+        found = stage.run(key, directory, *inputs)
+        directory.save_findings(stage.name, {**found, **provenance()})
     return directory.load_findings(stage.name)
 
 

@@ -115,7 +115,7 @@ def load(
 ) -> dict[str, Callable[[jax.Array], jax.Array]]:
     """The policies of a run of any method that has `policies`, by target; they take modes."""
     agent, settings = policies.agent_of(config.policies)
-    names = config.target_names
+    names = config.policy_names
     key, action_dim = jax.random.PRNGKey(0), env.action_size
     example = jax.eval_shape(lambda key: _random_policy(key, env, config.policies), key)
     stacked = directory.load_output(

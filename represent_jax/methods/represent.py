@@ -109,7 +109,7 @@ def last_stages(
 
     def judge_policies(key, directory, rewards, trained):
         episodes = results.agents_episodes(
-            config.policies, problem.env, config.target_names, trained
+            config.policies, problem.env, config.policy_names, trained
         )
         learned = results.learned_returns(rewards_of(rewards))
         return results.judge_policies(
@@ -117,6 +117,8 @@ def last_stages(
         )
 
     settings = {"policies": config.policies, "population": config.population}
+    if config.policy_names != config.target_names:
+        settings["policy_targets"] = config.policy_names
     return (
         Stage("reward_evaluation", judge_rewards, ("noise", "curve", "regression"), reports=True),
         Stage("policies", train, ("airl", "regression"), settings),
@@ -169,6 +171,7 @@ def _objectives(
     return {
         name: policies.make_objective(view, scale, env, config.policies)
         for name, view in views.items()
+        if name in config.policy_names
     }
 
 

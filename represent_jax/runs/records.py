@@ -186,7 +186,7 @@ def append_results(
         "backend": results["backend"],
         "config_hash": config_hash,
         "seconds": sum(results["seconds"].values()),
-        **provenance(),
+        **{name: results.get(name, here) for name, here in provenance().items()},
     }
     held = set()
     if only_new:

@@ -75,3 +75,14 @@ def test_every_stage_depends_on_the_seed(hashes):
 
 def _run(variant):
     return [variant, "separate", 0]
+
+
+def test_policies_of_some_targets_share_all_that_comes_before():
+    (whole,) = entries(["2"], ["half_cheetah"], [0], "smoke", variants=["represent"])
+    (part,) = entries(
+        ["2"], ["half_cheetah"], [0], "smoke", ["policy_targets=task"], variants=["represent"]
+    )
+    assert whole.reports["reward_evaluation"].hash == part.reports["reward_evaluation"].hash
+    assert whole.reports["policy_evaluation"].hash != part.reports["policy_evaluation"].hash
+    with pytest.raises(UsageError, match="strategy_1"):
+        VARIANTS["represent"].config("smoke", "hopper", ["policy_targets=strategy1"])

@@ -130,6 +130,20 @@ def test_ssrr_on_one_strategy_with_ppo_throughout(tmp_path):
     assert rj.load_policy(out, "strategy_2")(obs).shape == (3, 6)
 
 
+def test_a_policy_for_some_of_the_targets(tmp_path):
+    out = tmp_path / "task_only"
+    overrides = ("policy_targets=task", "num_strategies=1")
+    flags = [f"--override={one}" for one in overrides]
+    _finish(_launch(out, "--backend=mujoco", "--env=inverted_double_pendulum", *flags))
+    results = _results(out)
+    assert set(results["rewards"]) == {"task", "strategy_1"}
+    assert set(results["policies"]) == {"task"}
+    obs = np.zeros((3, 11), np.float32)
+    assert rj.load_policy(out)(obs).shape == (3, 1)
+    with pytest.raises(UsageError, match="task"):
+        rj.load_policy(out, "strategy_1")
+
+
 def test_merged_demonstrations_are_those_of_one_strategy():
     config = make_config("smoke", "half_cheetah", "ssrr")
     env = rj.make_env("half_cheetah", "mujoco")

@@ -106,3 +106,20 @@ def test_commit_of_a_checkout(tmp_path, monkeypatch):
     assert records._commit() == commit
     code.write_text("x = 1")
     assert records._commit() == f"{commit}-dirty"
+
+
+def test_results_are_recorded_with_the_commit_they_were_found_with(tmp_path):
+    results = {
+        "env": "hopper",
+        "seed": 0,
+        "preset": "smoke",
+        "backend": "mujoco",
+        "seconds": {"policies": 2.0},
+        "demonstrators": [{"name": "strategy_1", "return_mean": 3.0}],
+    }
+    path = tmp_path / "records.jsonl"
+    records.append_results(path, "represent", "hash", results | {"commit": "earlier"})
+    records.append_results(path, "represent", "hash", results)
+    found = runs.read_records(path)
+    assert [one["commit"] for one in found] == ["earlier", runs.provenance()["commit"]]
+    assert found[0]["device"] == runs.provenance()["device"]
