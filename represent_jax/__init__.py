@@ -12,6 +12,8 @@ from typing import Any
 _HOME = {
     "make_env": "represent_jax.envs",
     "load_demonstrations": "represent_jax.data.catalogue",
+    "make_config": "represent_jax.methods.presets",
+    "learn": "represent_jax.api",
     "load_config": "represent_jax.api",
     "load_reward": "represent_jax.api",
     "load_policy": "represent_jax.api",
@@ -20,7 +22,15 @@ _HOME = {
 # Learned rewards in the interfaces of other libraries.
 _MODULES = ("brax", "gymnasium")
 
-__all__ = ["load_config", "load_demonstrations", "load_policy", "load_reward", "make_env"]
+__all__ = [
+    "learn",
+    "load_config",
+    "load_demonstrations",
+    "load_policy",
+    "load_reward",
+    "make_config",
+    "make_env",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,17 +1,51 @@
-"""What research code needs of a finished run: its rewards and its policies."""
+"""What research code needs: to make a run, and of a finished one its rewards and policies."""
 
 import os
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from represent_jax import config as configs
+from represent_jax.data.trajectories import Demonstrations
 from represent_jax.envs import make_env
 from represent_jax.errors import unknown
-from represent_jax.methods.config import MethodConfig
+from represent_jax.methods.config import MethodConfig, make_problem
+from represent_jax.methods.plan import execute
 from represent_jax.methods.registry import find_method
-from represent_jax.runs import RunDirectory, load_config_json
+from represent_jax.runs import RunDirectory, load_config_json, open_run
+
+
+def learn(
+    run_dir: str | os.PathLike,
+    config: MethodConfig,
+    demonstrations: Demonstrations,
+    test: Demonstrations,
+    until: str = "",
+    resume: bool = False,
+) -> dict[str, Any] | None:
+    """Runs a method in a folder, as `python -m experiments.represent` does.
+
+    Args:
+      run_dir: folder of the run, new unless it is resumed.
+      config: settings, such as those of `make_config`.
+      demonstrations: of every strategy; the true reward in them is not learned from.
+      test: unseen trajectories, on which learned rewards are judged.
+      until: the last stage to run, such as "regression"; all if empty.
+      resume: whether to go on with what the folder holds.
+
+    Returns:
+      What was found, None where the run stopped before its last stage.
+
+    Raises:
+      UsageError: no stage of that name, or the folder holds a run already.
+      RepresentError: the data do not fit the environment, or a loss diverged.
+    """
+    problem = make_problem(config, make_env(config.env, config.backend), demonstrations, test)
+    with open_run(run_dir, config, resume=resume) as run:
+        stages = find_method(config.method).plan(config, problem)
+        return execute(config, problem, stages, run, until)
 
 
 def load_config(run_dir: str | os.PathLike) -> MethodConfig:
