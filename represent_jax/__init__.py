@@ -17,12 +17,14 @@ _HOME = {
     "load_config": "represent_jax.api",
     "load_reward": "represent_jax.api",
     "load_policy": "represent_jax.api",
+    "infer_strategies": "represent_jax.api",
 }
 
 # Learned rewards in the interfaces of other libraries.
 _MODULES = ("brax", "gymnasium")
 
 __all__ = [
+    "infer_strategies",
     "learn",
     "load_config",
     "load_demonstrations",

@@ -15,13 +15,14 @@ from represent_jax.methods.config import MethodConfig, make_problem
 from represent_jax.methods.plan import execute
 from represent_jax.methods.registry import find_method
 from represent_jax.runs import RunDirectory, load_config_json, open_run
+from represent_jax.stages import strategies
 
 
 def learn(
     run_dir: str | os.PathLike,
     config: MethodConfig,
     demonstrations: Demonstrations,
-    test: Demonstrations,
+    test: Demonstrations | None = None,
     until: str = "",
     resume: bool = False,
 ) -> dict[str, Any] | None:
@@ -31,7 +32,7 @@ def learn(
       run_dir: folder of the run, new unless it is resumed.
       config: settings, such as those of `make_config`.
       demonstrations: of every strategy; the true reward in them is not learned from.
-      test: unseen trajectories, on which learned rewards are judged.
+      test: unseen trajectories, on which learned rewards are judged; may be none.
       until: the last stage to run, such as "regression"; all if empty.
       resume: whether to go on with what the folder holds.
 
@@ -58,13 +59,36 @@ def load_config(run_dir: str | os.PathLike) -> MethodConfig:
     return configs.from_dict(find_method(stored.get("method", "represent")).config, stored)
 
 
+def infer_strategies(
+    demonstrations: Demonstrations, num_strategies: int = 0, seed: int = 0
+) -> Demonstrations:
+    """Labels demonstrations by strategy; the labels that they carry are not looked at.
+
+    Args:
+      demonstrations: the pool.
+      num_strategies: how many strategies there are; 0 if that is to be found out.
+      seed: seed of the random features and of the resamples.
+
+    Returns:
+      The same demonstrations with strategies numbered by first appearance; the metadata holds the
+      confidence of each trajectory's label, under "inferred_strategies".
+
+    Raises:
+      RepresentError: a trajectory is too short to tell.
+    """
+    config = strategies.StrategiesConfig(num_strategies=num_strategies)
+    found = strategies.infer(jax.random.PRNGKey(seed), demonstrations.trajectories, config)
+    return strategies.label(demonstrations, found)
+
+
 def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
     """Loads a run's rewards as one function.
 
     Returns:
       `reward(obs_t, action_t, next_obs_t, target="task")`, which takes NumPy or JAX arrays of
       shape `[..., dim]` and returns `[...]`; `target` is "task" (R^0), or "strategy_1" (R^1) and
-      so on. It can be called under the caller's own jit and vmap.
+      so on. It can be called under the caller's own jit and vmap. Actions may be None unless the
+      reward was made to see them.
 
     Raises:
       RepresentError: the run has not finished its reward learning, or its method learns none.
@@ -77,7 +101,8 @@ def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
     def reward(obs_t, action_t, next_obs_t, target: str = "task") -> jax.Array:
         if target not in rewards:
             raise unknown("target", target, rewards)
-        return rewards[target](*(jnp.asarray(x) for x in (obs_t, action_t, next_obs_t)))
+        rows = (obs_t, action_t, next_obs_t)
+        return rewards[target](*(None if x is None else jnp.asarray(x) for x in rows))
 
     return reward
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from represent_jax import config as configs
 from represent_jax.campaign.variants import VARIANTS, runs_of
-from represent_jax.data.catalogue import load_demonstrations
+from represent_jax.data.catalogue import load_demonstrations, load_test
 from represent_jax.envs import make_env
 from represent_jax.methods.config import MethodConfig, Problem, make_problem
 from represent_jax.methods.plan import nodes
@@ -64,7 +64,7 @@ def _entry(variant: str, config: MethodConfig, reached: Sequence[str]) -> Entry:
         config,
         env,
         _data(config.demonstrations or config.env),
-        _data(f"{config.env}_test"),
+        _test(config.env, config.test),
     )
     stages = find_method(config.method).plan(config, problem)
     made = nodes(config, problem, stages, f"{config.env} {variant} seed {config.seed}")
@@ -81,6 +81,11 @@ def _env(name: str, backend: str):
 @functools.cache
 def _data(name: str):
     return load_demonstrations(name)
+
+
+@functools.cache
+def _test(env_name: str, name: str):
+    return load_test(env_name, name)
 
 
 def record(graph: Graph, every: Iterable[Entry], path: str | os.PathLike) -> None:
