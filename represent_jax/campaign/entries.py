@@ -17,17 +17,38 @@ from represent_jax.runs.graph import Graph, Node
 from represent_jax.runs.records import append_results
 
 
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """What a run is made from, in words that another process can read.
+
+    Attributes:
+      variant: one of `campaign.variants`.
+      domain: the environment's name.
+      preset: name of the preset.
+      overrides: settings as `dotted.key=value`.
+      reached: the stages that have to be reached.
+    """
+
+    variant: str
+    domain: str
+    preset: str
+    overrides: tuple[str, ...]
+    reached: tuple[str, ...]
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Entry:
     """One run of the campaign.
 
     Attributes:
+      recipe: what it is made from.
       variant: what records call it.
       config: its settings.
       problem: what it is given.
       reports: the nodes whose outputs are recorded, by stage.
     """
 
+    recipe: Recipe
     variant: str
     config: MethodConfig
     problem: Problem
@@ -53,12 +74,20 @@ def entries(
     for seed in seeds:
         for domain, runs in wanted.items():
             for variant, reached in runs.items():
-                config = VARIANTS[variant].config(preset, domain, [*overrides, f"seed={seed}"])
-                found.append(_entry(variant, config, reached))
+                settings = (*overrides, f"seed={seed}")
+                found.append(make_entry(Recipe(variant, domain, preset, settings, reached)))
     return found
 
 
-def _entry(variant: str, config: MethodConfig, reached: Sequence[str]) -> Entry:
+def make_entry(recipe: Recipe) -> Entry:
+    """Makes a run: its settings, what it is given, its stages as nodes.
+
+    Raises:
+      UsageError: no variant, domain or preset of that name, or a setting that does not fit.
+      RepresentError: demonstrations do not fit their environment.
+    """
+    variant = VARIANTS[recipe.variant]
+    config = variant.config(recipe.preset, recipe.domain, recipe.overrides)
     env = _env(config.env, config.backend)
     problem = make_problem(
         config,
@@ -67,10 +96,10 @@ def _entry(variant: str, config: MethodConfig, reached: Sequence[str]) -> Entry:
         _test(config.env, config.test),
     )
     stages = find_method(config.method).plan(config, problem)
-    made = nodes(config, problem, stages, f"{config.env} {variant} seed {config.seed}")
-    last = max(i for i, stage in enumerate(stages) if stage.name in reached)
+    made = nodes(config, problem, stages, f"{config.env} {recipe.variant} seed {config.seed}")
+    last = max(i for i, stage in enumerate(stages) if stage.name in recipe.reached)
     reports = {stage.name: made[stage.name] for stage in stages[: last + 1] if stage.reports}
-    return Entry(VARIANTS[variant].name, config, problem, reports)
+    return Entry(recipe, variant.name, config, problem, reports)
 
 
 @functools.cache

@@ -216,7 +216,7 @@ def judge_policies(
     log: Sequence[Mapping[str, Any]],
     directory: RunDirectory,
 ) -> dict[str, Any]:
-    """True return, learned return and style of policies; saves their learning curves.
+    """True return, learned return, style and the task's outcomes; saves learning curves.
 
     Args:
       key: PRNG key.
@@ -259,6 +259,10 @@ def judge_policies(
                 float(np.mean(learned[name](batch))) if name in learned else None
             ),
             "style_kept": None if group is None else float(shares[group]),
+            **{
+                quantity: float(np.mean(values))
+                for quantity, values in problem.env.unwrapped.task.outcomes(batch.obs).items()
+            },
         }
         if means is not None:
             base = float(np.mean(means)) if group is None else means[group]

@@ -41,6 +41,8 @@ _PALM = {
 
 _BOX, _CAPSULE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
 _CYLINDER, _PLANE = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_PLANE
+# Which sizes of a geom make it thicker.
+_GROWS = {_BOX: (1.0, 1.0, 1.0), _CAPSULE: (1.0, 0.0, 0.0), _PLANE: (0.0, 0.0, 0.0)}
 
 
 def load_full() -> mujoco.MjModel:
@@ -57,6 +59,10 @@ def load_light() -> mujoco.MjModel:
 
     Bodies keep the masses and inertias of the full scene. Positions are those of the arm (9) and
     of the kettle (7); nothing else moves, and contacts have no torsional or rolling friction.
+
+    On CPU hosts MJX needs `XLA_FLAGS=--xla_cpu_use_fusion_emitters=false`, or the same among the
+    `compiler_options` of the outermost jit: fused, the arm's chain of eleven bodies is computed
+    anew for every body behind, and a step takes minutes.
 
     Raises:
       RepresentError: gymnasium-robotics is not installed.
@@ -80,6 +86,9 @@ def load_light() -> mujoco.MjModel:
         geom.material = ""
         if geom.type == _CYLINDER:
             geom.type = _CAPSULE
+        # MJX's boxes do not feel each other before they touch, so margins become thickness.
+        geom.size = geom.size + np.array(_GROWS[geom.type]) * geom.margin
+        geom.margin = 0.0
     for element in (*spec.meshes, *spec.textures, *spec.materials):
         spec.delete(element)
     return spec.compile()
