@@ -1,6 +1,7 @@
 """A second place for what a run logs: Weights & Biases, imported only when it is asked for."""
 
 import os
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -77,7 +78,7 @@ class WandbTracker:
         known = self._folder / "wandb" / "id"
         known.parent.mkdir(parents=True, exist_ok=True)
         if not known.is_file():
-            known.write_text(self._wandb.util.generate_id())
+            known.write_text(secrets.token_hex(4))
         return self._wandb.init(
             id=known.read_text(),
             resume="allow",
