@@ -65,6 +65,11 @@ class Task(abc.ABC):
         del physics
         return jnp.zeros((), bool)
 
+    def readings(self, physics: PhysicsState) -> dict[str, jax.Array]:
+        """Returns figures that help a driver, each `[]`, by a name with its unit; often none."""
+        del physics
+        return {}
+
     def keyboard(self, model: mujoco.MjModel) -> Keyboard | None:
         """Returns the keys that drive the robot; None where it can only be watched."""
         del model
