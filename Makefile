@@ -2,7 +2,7 @@
 SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test lint format lock bench clean
+.PHONY: help demo test test-extras lint format lock bench clean
 
 PYTHON ?= python3.12 python3.13 python3.11 python3
 VENV ?= .venv
@@ -26,7 +26,7 @@ define install
 endef
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' Makefile
 
 demo: $(VENV)/.installed ## demonstrations of two imperfect cheetahs -> rewards, policies, a report
 	@$(RUN) experiments.represent --env=half_cheetah --preset=quick --out=$(DEMO_OUT) --resume
@@ -34,6 +34,9 @@ demo: $(VENV)/.installed ## demonstrations of two imperfect cheetahs -> rewards,
 
 test: lint ## ruff, then the whole test suite
 	@$(RUN) pytest -n 2 --dist loadscope
+
+test-extras: $(VENV)/.installed-extras ## tests that need optional libraries: Ray, Stable-Baselines3
+	@$(RUN) pytest -m extras
 
 lint: $(VENV)/.installed-dev ## ruff check and format check
 	@$(RUN) ruff check .
@@ -72,3 +75,8 @@ $(VENV)/.installed-dev: EXTRAS := [dev,video]
 $(VENV)/.installed-dev: $(VENV)/.created pyproject.toml constraints.txt
 	$(install)
 	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-extras: EXTRAS := [dev,video,ray,sb3]
+$(VENV)/.installed-extras: $(VENV)/.created pyproject.toml constraints.txt
+	$(install)
+	@touch $@ $(VENV)/.installed $(VENV)/.installed-dev

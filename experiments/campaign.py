@@ -2,21 +2,25 @@
 
 python -m experiments.campaign --tables=1,2,3,5 --seeds=5 --preset=paper
 python -m experiments.campaign --tables=1 --domains=hopper --seeds=1 --preset=smoke --dry_run
+python -m experiments.campaign --engine=ray --address=auto --seeds=5 --preset=paper
 
 Killed at any time, the same command goes on. Stages that several methods need are shared between
 them, found again by the hash of what they depend on.
 """
 
+import contextlib
 import time
 
 from absl import flags
 
 from experiments import launch
-from represent_jax.campaign.entries import entries, record
+from represent_jax.campaign.entries import Entry, entries, record
 from represent_jax.campaign.variants import DOMAINS, TABLES
-from represent_jax.errors import RepresentError
+from represent_jax.errors import RepresentError, unknown
 from represent_jax.report.values import format_duration
-from represent_jax.runs.graph import BLOCKED, FAILED, Graph, Node
+from represent_jax.runs.graph import BLOCKED, FAILED, Engine, Graph, InTurn, Node
+
+_ENGINES = ("local", "ray")
 
 _TABLES = flags.DEFINE_list("tables", ["1", "2", "3", "5"], f"Of {', '.join(TABLES)}.")
 _DOMAINS = flags.DEFINE_list("domains", list(DOMAINS), "Environments.")
@@ -28,10 +32,18 @@ _OUT = flags.DEFINE_string("out", "runs/campaign", "Folder of the campaign.")
 _RECORD = flags.DEFINE_string("record", None, "File of records; <out>/records.jsonl if not given.")
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting of every run that has it.")
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Show what is done and left, and run nothing.")
+_ENGINE = flags.DEFINE_string("engine", "local", "Where stages run: local, in turn, or ray.")
+_ADDRESS = flags.DEFINE_string("address", "local", "Of Ray: local starts one here, auto, or host.")
+_SHARED = flags.DEFINE_bool("shared_folder", True, "Whether Ray's workers see --out.")
+_RETRIES = flags.DEFINE_integer("retries", 3, "Of a stage that lost its Ray worker.")
+_CPUS = flags.DEFINE_float("stage_cpus", 1.0, "What Ray sets aside for a stage.")
+_GPUS = flags.DEFINE_float("stage_gpus", 0.0, "What Ray sets aside for a stage.")
 
 
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
+    if _ENGINE.value not in _ENGINES:
+        raise unknown("engine", _ENGINE.value, _ENGINES)
     seeds = range(_SEED.value, _SEED.value + _SEEDS.value)
     every = entries(
         _TABLES.value, _DOMAINS.value, seeds, _PRESET.value, _OVERRIDE.value, _VARIANTS.value
@@ -56,11 +68,13 @@ def main(argv: list[str]) -> None:
         if node.hash in started:
             said += f" after {format_duration(time.monotonic() - started[node.hash])}"
         left = graph.seconds_left()
-        said += "" if left is None else f"; {format_duration(left)} left"
+        what = "left" if _ENGINE.value == "local" else "of work left"
+        said += "" if left is None else f"; {format_duration(left)} {what}"
         print(f"{number} {node.name}: {state} {said}", flush=True)
         record(graph, (entry for entry in every if node in entry.reports.values()), records)
 
-    graph.run(report)
+    with _engine(every) as engine:
+        graph.run(report, engine)
     bad = [node for node in graph.nodes if graph.states[node.hash] in (FAILED, BLOCKED)]
     print(f"{len(graph.nodes) - len(bad)} of {len(graph.nodes)} stages done; records: {records}")
     if bad:
@@ -68,6 +82,15 @@ def main(argv: list[str]) -> None:
             f"{node.name} ({graph.errors[node.hash]})" for node in bad if node.hash in graph.errors
         ]
         raise RepresentError(f"{len(bad)} stages are not done; failed: {'; '.join(failed)}")
+
+
+def _engine(every: list[Entry]) -> contextlib.AbstractContextManager[Engine]:
+    if _ENGINE.value == "local":
+        return contextlib.nullcontext(InTurn())
+    from represent_jax.campaign.ray_engine import RayConfig, RayEngine
+
+    config = RayConfig(_ADDRESS.value, _SHARED.value, _RETRIES.value, _CPUS.value, _GPUS.value)
+    return RayEngine(every, config)
 
 
 if __name__ == "__main__":

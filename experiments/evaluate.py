@@ -12,9 +12,10 @@ from absl import flags
 from experiments import launch
 from represent_jax.agents import rollout
 from represent_jax.api import load_config, load_policy, load_reward
-from represent_jax.data.catalogue import load_demonstrations
+from represent_jax.data.catalogue import load_test
 from represent_jax.data.trajectories import pad
 from represent_jax.envs import Episode, make_env
+from represent_jax.errors import UsageError
 from represent_jax.report import tables
 from represent_jax.report.values import display_name, format_number
 from represent_jax.runs import RunDirectory
@@ -22,7 +23,9 @@ from represent_jax.stages import evaluation
 
 _RUN = flags.DEFINE_string("run", None, "Run folder.", required=True)
 _TRAJECTORIES = flags.DEFINE_string(
-    "trajectories", "", "Name or npz file of trajectories; the environment's test set if empty."
+    "trajectories",
+    "",
+    "Name or npz file of trajectories; those that the run was judged on if empty.",
 )
 _EPISODES = flags.DEFINE_integer("episodes", 10, "Episodes of each policy.", lower_bound=1)
 _NOISE_LEVEL = flags.DEFINE_float(
@@ -42,12 +45,18 @@ def main(argv: list[str]) -> None:
     reward = load_reward(_RUN.value)
     env = make_env(config.env, _BACKEND.value or config.backend)
     env = Episode(env, config.horizon or env.horizon, auto_reset=False)
-    data = load_demonstrations(_TRAJECTORIES.value or f"{config.env}_test")
-    data.check_against(env.observation_size, env.action_size, -1.0, 1.0)
-    batch = pad(data.trajectories, max(t.length for t in data.trajectories))
-    targets = config.target_names
+    data = load_test(config.env, _TRAJECTORIES.value or config.test)
     has_policies = RunDirectory(_RUN.value).is_done("policies")
-    columns = ("target", "Pearson", "Spearman")
+    if data is None and not has_policies:
+        raise UsageError(f"no trajectories of {config.env} ship: give some with --trajectories")
+    batch, columns = None, ("target",)
+    if data is not None:
+        data.check_against(env.observation_size, env.action_size, -1.0, 1.0)
+        if not data.has_rewards:
+            raise UsageError("the trajectories hold no true rewards, to compare learned ones with")
+        batch = pad(data.trajectories, max(t.length for t in data.trajectories))
+        columns += ("Pearson", "Spearman")
+    targets = config.target_names
     if has_policies:
         columns += ("true return", "std", "learned return", "std")
     rows = []
@@ -56,9 +65,11 @@ def main(argv: list[str]) -> None:
         def learned(_, *transition, target=target):
             return reward(*transition, target=target)
 
-        returns = rollout.learned_returns(batch, learned, None)
-        found = evaluation.correlate(rollout.true_returns(batch), returns)
-        row = [display_name(target), *(format_number(float(x), 3) for x in found)]
+        row = [display_name(target)]
+        if batch is not None:
+            returns = rollout.learned_returns(batch, learned, None)
+            found = evaluation.correlate(rollout.true_returns(batch), returns)
+            row += [format_number(float(x), 3) for x in found]
         if has_policies and target in config.policy_names:
             policy = load_policy(_RUN.value, target)
             episodes = jax.jit(
@@ -77,7 +88,8 @@ def main(argv: list[str]) -> None:
                 row += [format_number(float(np.mean(values))), format_number(float(np.std(values)))]
         rows.append((*row, *["-"] * (len(columns) - len(row))))
     table = tables.Table(
-        title=f"{len(data.trajectories)} trajectories, {_EPISODES.value} episodes of each policy",
+        title=f"{len(data.trajectories) if data else 'No'} trajectories, "
+        f"{_EPISODES.value} episodes of each policy",
         columns=columns,
         rows=tuple(rows),
         note="",

@@ -15,14 +15,14 @@ from absl import flags
 from experiments import launch
 from represent_jax.campaign import figures as campaign_figures
 from represent_jax.campaign.entries import Entry, entries
-from represent_jax.campaign.variants import DOMAINS
+from represent_jax.campaign.variants import GYM_DOMAINS
 from represent_jax.errors import RepresentError
 from represent_jax.report import figures
 from represent_jax.runs import RunDirectory
 from represent_jax.runs.graph import Graph
 
 _CAMPAIGN = flags.DEFINE_string("campaign", "runs/campaign", "Folder of the campaign.")
-_DOMAINS = flags.DEFINE_list("domains", list(DOMAINS), "Environments.")
+_DOMAINS = flags.DEFINE_list("domains", list(GYM_DOMAINS), "Environments.")
 _SEEDS = flags.DEFINE_integer("seeds", 5, "Number of seeds; 3 and 4 show the first.", lower_bound=1)
 _SEED = flags.DEFINE_integer("seed", 0, "First of the seeds.", lower_bound=0)
 _PRESET = flags.DEFINE_string("preset", "paper", "Settings the campaign began with.")

@@ -4,16 +4,19 @@ python -m experiments.make_demonstrations --env=half_cheetah --out=represent_jax
 """
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from absl import flags
 
 from experiments import launch
 from represent_jax import config as configs
 from represent_jax.data.npz import save_demonstrations
-from represent_jax.data.trajectories import Demonstrations
+from represent_jax.data.trajectories import Demonstrations, Trajectory
+from represent_jax.envs import Environment, make_env
 from represent_jax.errors import unknown
-from represent_jax.methods import demonstrators
+from represent_jax.methods import demonstrators, operators
 from represent_jax.stages import style
 
 _ENV = flags.DEFINE_string("env", "half_cheetah", "Environment whose demonstrators to make.")
@@ -22,19 +25,24 @@ _PART = flags.DEFINE_enum("part", "both", ["both", "demonstrations", "test"], "W
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting as dotted.key=value; repeatable.")
 _BACKEND = flags.DEFINE_string("backend", "auto", "Physics engine: auto, mujoco or mjx.")
 
+_OPERATORS = operators.OperatorsConfig()
+
 
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
-    if _ENV.value not in demonstrators.DEMONSTRATORS:
-        raise unknown("environment", _ENV.value, demonstrators.DEMONSTRATORS)
-    config = demonstrators.DEMONSTRATORS[_ENV.value]
-    config = configs.apply_overrides(config, _OVERRIDE.value)
+    known = {**demonstrators.DEMONSTRATORS, _OPERATORS.env: _OPERATORS}
+    if _ENV.value not in known:
+        raise unknown("environment", _ENV.value, known)
+    config = configs.apply_overrides(known[_ENV.value], _OVERRIDE.value)
     out = Path(_OUT.value)
     os.makedirs(out, exist_ok=True)
+    driven = isinstance(config, operators.OperatorsConfig)
     if _PART.value in ("both", "demonstrations"):
-        _make_demonstrations(config, out / f"{config.env}.npz")
+        make = _drive_demonstrations if driven else _make_demonstrations
+        make(config, out / f"{config.env}.npz")
     if _PART.value in ("both", "test"):
-        _make_test_set(config, out / f"{config.env}_test.npz")
+        make = _drive_test_set if driven else _make_test_set
+        make(config, out / f"{config.env}_test.npz")
 
 
 def _make_demonstrations(config: demonstrators.DemonstratorConfig, path: Path) -> None:
@@ -54,18 +62,57 @@ def _make_demonstrations(config: demonstrators.DemonstratorConfig, path: Path) -
         config.strategy_order,
         config.steadiness_weight,
     )
-    accuracy = style.pairwise_accuracy(trajectories)
     metadata = {
         "source": "DIAYN with environment reward, early stopping per skill",
         "snapshot_env_steps": env_steps,
-        "style_accuracy": accuracy,
+        "style_accuracy": style.pairwise_accuracy(trajectories),
         "config": configs.to_dict(config),
     }
     data = Demonstrations(config.env, tuple(trajectories), metadata)
     save_demonstrations(path, data)
-    for i, target in enumerate(config.target_returns):
+    _print_demonstrations(data, config.target_returns, path)
+
+
+def _drive_demonstrations(config: operators.OperatorsConfig, path: Path) -> None:
+    env = make_env(config.env, "mujoco")
+    trajectories = operators.demonstrate(operators.Driver(env), config)
+    metadata = {
+        "source": "scripted operators of the keys (no person): 1 pushes the body, 2 holds the "
+        "handle; of their episodes those nearest to the paper's mean returns",
+        "outcomes": _outcomes(env, trajectories),
+        "style_accuracy": style.pairwise_accuracy(trajectories),
+        "config": configs.to_dict(config),
+    }
+    data = Demonstrations(config.env, tuple(trajectories), metadata)
+    save_demonstrations(path, data)
+    _print_demonstrations(data, config.target_returns, path)
+
+
+def _drive_test_set(config: operators.OperatorsConfig, path: Path) -> None:
+    env = make_env(config.env, "mujoco")
+    trajectories = operators.make_test_set(operators.Driver(env), config)
+    metadata = {
+        "source": "scripted operators of the keys (no person), from deft to hopeless",
+        "outcomes": _outcomes(env, trajectories),
+        "config": configs.to_dict(config),
+    }
+    data = Demonstrations(config.env, tuple(trajectories), metadata)
+    save_demonstrations(path, data)
+    _print_test_set(data, path)
+
+
+def _outcomes(env: Environment, trajectories: Sequence[Trajectory]) -> dict[str, list[float]]:
+    """What every episode came to."""
+    found = env.task.outcomes(np.stack([t.obs for t in trajectories]))
+    return {name: np.round(values, 4).tolist() for name, values in found.items()}
+
+
+def _print_demonstrations(data: Demonstrations, targets: Sequence[float], path: Path) -> None:
+    for i, target in enumerate(targets):
         print(f"strategy {i + 1}: return {data.mean_return(i):.1f}, wanted {target:.1f}")
-    print(f"styles told apart: {accuracy}; written to {path}")
+    for name, values in data.metadata.get("outcomes", {}).items():
+        print(f"{name}: {values}")
+    print(f"styles told apart: {data.metadata['style_accuracy']}; written to {path}")
 
 
 def _make_test_set(config: demonstrators.DemonstratorConfig, path: Path) -> None:
@@ -86,6 +133,11 @@ def _make_test_set(config: demonstrators.DemonstratorConfig, path: Path) -> None
     }
     data = Demonstrations(config.env, tuple(trajectories), metadata)
     save_demonstrations(path, data)
+    _print_test_set(data, path)
+
+
+def _print_test_set(data: Demonstrations, path: Path) -> None:
+    trajectories = data.trajectories
     returns = sorted(t.total_reward for t in trajectories)
     print(
         f"{len(returns)} test trajectories, returns {returns[0]:.0f} to {returns[-1]:.0f}: {path}"

@@ -3,6 +3,7 @@
 python -m experiments.represent --env=half_cheetah --preset=quick --out=runs/demo
 python -m experiments.represent --env=hopper --seed=1 --override policies.env_steps=200000
 python -m experiments.represent --env=hopper --until=regression --out=runs/hopper
+python -m experiments.represent --env=hopper --demonstrations=mine.npz --test=unseen.npz
 """
 
 import dataclasses
@@ -12,7 +13,7 @@ from absl import flags
 
 from experiments import launch
 from represent_jax import config as configs
-from represent_jax.data.catalogue import load_demonstrations
+from represent_jax.data.catalogue import load_demonstrations, load_test
 from represent_jax.envs import make_env
 from represent_jax.methods.config import MethodConfig, make_problem
 from represent_jax.methods.plan import execute
@@ -30,6 +31,12 @@ _NUM_SEEDS = flags.DEFINE_integer("num_seeds", 1, "Number of seeds, from --seed 
 _BACKEND = flags.DEFINE_string("backend", "auto", "Physics engine: auto, mujoco or mjx.")
 _DEMONSTRATIONS = flags.DEFINE_string(
     "demonstrations", "", "Name or npz file of demonstrations; the environment's own if empty."
+)
+_TEST = flags.DEFINE_string(
+    "test",
+    "",
+    "Name or npz file of unseen trajectories with true rewards, to judge rewards on; the "
+    "environment's own if empty, none where none ship.",
 )
 _OUT = flags.DEFINE_string(
     "out", None, "Run folder; runs/<env>-<method>-<preset>-<seed> if not given."
@@ -51,6 +58,7 @@ def main(argv: list[str]) -> None:
             seed=seed,
             backend=_BACKEND.value,
             demonstrations=_DEMONSTRATIONS.value,
+            test=_TEST.value,
         )
         config = configs.apply_overrides(config, _OVERRIDE.value)
         out = _OUT.value or f"runs/{config.env}-{config.method}-{config.preset}-{seed}"
@@ -65,7 +73,7 @@ def _run(config: MethodConfig, out: str) -> None:
         config,
         env,
         load_demonstrations(config.demonstrations or config.env),
-        load_demonstrations(f"{config.env}_test"),
+        load_test(config.env, config.test),
     )
     print(json.dumps(configs.to_dict(config), indent=2))
     if problem.demonstrations.num_strategies == 1 and config.method == "represent":

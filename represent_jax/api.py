@@ -1,17 +1,52 @@
-"""What research code needs of a finished run: its rewards and its policies."""
+"""What research code needs: to make a run, and of a finished one its rewards and policies."""
 
 import os
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from represent_jax import config as configs
+from represent_jax.data.trajectories import Demonstrations
 from represent_jax.envs import make_env
 from represent_jax.errors import unknown
-from represent_jax.methods.config import MethodConfig
+from represent_jax.methods.config import MethodConfig, make_problem
+from represent_jax.methods.plan import execute
 from represent_jax.methods.registry import find_method
-from represent_jax.runs import RunDirectory, load_config_json
+from represent_jax.runs import RunDirectory, load_config_json, open_run
+from represent_jax.stages import strategies
+
+
+def learn(
+    run_dir: str | os.PathLike,
+    config: MethodConfig,
+    demonstrations: Demonstrations,
+    test: Demonstrations | None = None,
+    until: str = "",
+    resume: bool = False,
+) -> dict[str, Any] | None:
+    """Runs a method in a folder, as `python -m experiments.represent` does.
+
+    Args:
+      run_dir: folder of the run, new unless it is resumed.
+      config: settings, such as those of `make_config`.
+      demonstrations: of every strategy; the true reward in them is not learned from.
+      test: unseen trajectories, on which learned rewards are judged; may be none.
+      until: the last stage to run, such as "regression"; all if empty.
+      resume: whether to go on with what the folder holds.
+
+    Returns:
+      What was found, None where the run stopped before its last stage.
+
+    Raises:
+      UsageError: no stage of that name, or the folder holds a run already.
+      RepresentError: the data do not fit the environment, or a loss diverged.
+    """
+    problem = make_problem(config, make_env(config.env, config.backend), demonstrations, test)
+    with open_run(run_dir, config, resume=resume) as run:
+        stages = find_method(config.method).plan(config, problem)
+        return execute(config, problem, stages, run, until)
 
 
 def load_config(run_dir: str | os.PathLike) -> MethodConfig:
@@ -24,13 +59,36 @@ def load_config(run_dir: str | os.PathLike) -> MethodConfig:
     return configs.from_dict(find_method(stored.get("method", "represent")).config, stored)
 
 
+def infer_strategies(
+    demonstrations: Demonstrations, num_strategies: int = 0, seed: int = 0
+) -> Demonstrations:
+    """Labels demonstrations by strategy; the labels that they carry are not looked at.
+
+    Args:
+      demonstrations: the pool.
+      num_strategies: how many strategies there are; 0 if that is to be found out.
+      seed: seed of the random features and of the resamples.
+
+    Returns:
+      The same demonstrations with strategies numbered by first appearance; the metadata holds the
+      confidence of each trajectory's label, under "inferred_strategies".
+
+    Raises:
+      RepresentError: a trajectory is too short to tell.
+    """
+    config = strategies.StrategiesConfig(num_strategies=num_strategies)
+    found = strategies.infer(jax.random.PRNGKey(seed), demonstrations.trajectories, config)
+    return strategies.label(demonstrations, found)
+
+
 def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
     """Loads a run's rewards as one function.
 
     Returns:
       `reward(obs_t, action_t, next_obs_t, target="task")`, which takes NumPy or JAX arrays of
       shape `[..., dim]` and returns `[...]`; `target` is "task" (R^0), or "strategy_1" (R^1) and
-      so on. It can be called under the caller's own jit and vmap.
+      so on. It can be called under the caller's own jit and vmap. Actions may be None unless the
+      reward was made to see them.
 
     Raises:
       RepresentError: the run has not finished its reward learning, or its method learns none.
@@ -43,9 +101,42 @@ def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
     def reward(obs_t, action_t, next_obs_t, target: str = "task") -> jax.Array:
         if target not in rewards:
             raise unknown("target", target, rewards)
-        return rewards[target](*(jnp.asarray(x) for x in (obs_t, action_t, next_obs_t)))
+        rows = (obs_t, action_t, next_obs_t)
+        return rewards[target](*(None if x is None else jnp.asarray(x) for x in rows))
 
     return reward
+
+
+def load_reward_for(
+    run_dir: str | os.PathLike, target: str, observation_size: int, action_size: int
+) -> Callable[..., jax.Array]:
+    """Loads one of a run's rewards for an environment that was made elsewhere.
+
+    Args:
+      run_dir: folder of the run.
+      target: "task", or "strategy_1" and so on.
+      observation_size: entries of that environment's observations.
+      action_size: entries of its actions.
+
+    Returns:
+      `reward(obs_t, action_t, next_obs_t)`, for actions in [-1, 1]; see `load_reward`.
+
+    Raises:
+      RepresentError: the run has not finished its reward learning, or its method learns none.
+      UsageError: no target of that name, or the run's environment has other sizes.
+    """
+    config = load_config(run_dir)
+    env = make_env(config.env, config.backend)
+    for field, expected, found in (
+        ("observation size", env.observation_size, observation_size),
+        ("action size", env.action_size, action_size),
+    ):
+        in_run = f"{expected}, that of {config.env} in {run_dir}"
+        configs.require(found == expected, field, in_run, found)
+    rewards = find_method(config.method).load_rewards(config, env, RunDirectory(run_dir))
+    if target not in rewards:
+        raise unknown("target", target, rewards)
+    return rewards[target]
 
 
 def load_policy(

@@ -15,7 +15,8 @@ class Transition(NamedTuple):
 
     Attributes:
       obs_t: observation before the step, `[..., obs_dim]`.
-      action_t: the action that was executed (after noise), `[..., action_dim]`.
+      action_t: the action that was executed (after noise), `[..., action_dim]`; None throughout
+        demonstrations of states alone.
       next_obs_t: the true observation after the step, never that of a reset, `[..., obs_dim]`.
       reward_t: the environment's own reward, `[...]`.
       discount_t: 0 where the task terminated, 1 elsewhere (also at the time limit), `[...]`.
@@ -23,7 +24,7 @@ class Transition(NamedTuple):
     """
 
     obs_t: jax.Array
-    action_t: jax.Array
+    action_t: jax.Array | None
     next_obs_t: jax.Array
     reward_t: jax.Array
     discount_t: jax.Array

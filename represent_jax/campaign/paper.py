@@ -1,4 +1,4 @@
-"""The figures of the paper's Tables I, II, III and V (RA-L 2025), to be shown beside ours.
+"""The figures of the paper's Tables I to V (RA-L 2025), to be shown beside ours.
 
 By domain, target and method: mean and standard deviation of correlations, means of returns.
 """
@@ -95,6 +95,17 @@ ABLATIONS: dict[tuple[str, str], float] = {
     ("task", "represent"): 1692.14,
     ("task", "no_reg"): 1785.19,
     ("task", "no_bcd"): 1633.13,
+}
+
+# Table IV: Franka Kitchen; every strategy's line shows the one task policy.
+KITCHEN: dict[tuple[str, str], float] = {
+    ("strategy_1", "demonstrators"): -122.86,
+    ("strategy_1", "represent"): -121.94,
+    ("strategy_1", "bc"): -467.95,
+    ("strategy_2", "demonstrators"): -174.46,
+    ("strategy_2", "represent"): -169.20,
+    ("strategy_2", "bc"): -528.68,
+    ("task", "represent"): -106.48,
 }
 
 # Table V: three strategies on HalfCheetah.

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from represent_jax.campaign import paper
 from represent_jax.campaign.statistics import Aggregate, aggregate
-from represent_jax.campaign.variants import ABLATIONS, DOMAINS, NUMS_STRATEGIES
+from represent_jax.campaign.variants import ABLATIONS, GYM_DOMAINS, NUMS_STRATEGIES
 from represent_jax.errors import RepresentError, unknown
 from represent_jax.report.tables import Table
 from represent_jax.report.values import display_name, format_number
@@ -14,6 +14,7 @@ DOMAIN_NAMES = {
     "hopper": "Hopper",
     "half_cheetah": "HalfCheetah",
     "inverted_double_pendulum": "Double pendulum",
+    "franka_kitchen": "Franka Kitchen",
 }
 METHOD_NAMES = {
     "represent": "REPRESENT",
@@ -40,6 +41,7 @@ METHOD_NAMES = {
 }
 _TARGETS = ("task", "strategy_1", "strategy_2")
 _RETURNS = ("return_best", "return_final")
+_OUTCOMES = ("kettle_distance", "success")
 
 
 class Cell(NamedTuple):
@@ -94,7 +96,7 @@ class Select:
 def correlations(select: Select) -> list[Cell]:
     """Table I: learned against true return, pooled as in the paper, and on unseen trajectories."""
     cells = []
-    for domain in DOMAINS:
+    for domain in GYM_DOMAINS:
         for target in _TARGETS:
             methods = ["represent", "ssrr", "msrd"] + ["drex"] * (target == "task")
             for method in methods:
@@ -109,7 +111,7 @@ def correlations(select: Select) -> list[Cell]:
 def returns(select: Select) -> list[Cell]:
     """Table II: true return of policies, the highest as in the paper, and of the one kept."""
     cells = []
-    for domain in DOMAINS:
+    for domain in GYM_DOMAINS:
         for target in _TARGETS:
             cells.append(_demonstrated(select, domain, target))
             merged = ["drex", "bc", "bc_rnn"] if target == "task" else ["msrd"]
@@ -133,6 +135,21 @@ def ablations(select: Select) -> list[Cell]:
             paper.ABLATIONS.get((target, method)) if quantity == "return_best" else None
         ]
     ]
+
+
+def kitchen(select: Select) -> list[Cell]:
+    """Table IV: policies in Franka Kitchen, what their episodes come to, and the rewards."""
+    domain, cells = "franka_kitchen", []
+    for target in _TARGETS:
+        cells.append(_demonstrated(select, domain, target))
+        for method in ("represent", "ssrr", "msrd", "bc"):
+            published = paper.KITCHEN.get((target, method))
+            cells.append(select.cell(domain, target, method, "return_best", published))
+            for quantity in ("return_final", *_OUTCOMES, "pearson_test"):
+                cells.append(select.cell(domain, target, method, quantity))
+        if target != "task":
+            cells += _imitation(select, domain, target, "return_final")
+    return cells
 
 
 def three_strategies(select: Select) -> list[Cell]:
@@ -171,12 +188,12 @@ def _grid(
 
 def further_ablations(select: Select) -> list[Cell]:
     """Where the gain comes from: rewards without parts of the method."""
-    return _grid(select, DOMAINS, ("represent", *ABLATIONS), ("pearson_pooled", "pearson_test"))
+    return _grid(select, GYM_DOMAINS, ("represent", *ABLATIONS), ("pearson_pooled", "pearson_test"))
 
 
 def cold_starts(select: Select) -> list[Cell]:
     """What starting from Phase 1's policies does."""
-    return _grid(select, DOMAINS, ("represent", "cold"), _RETURNS)
+    return _grid(select, GYM_DOMAINS, ("represent", "cold"), _RETURNS)
 
 
 def speeds(select: Select) -> list[Cell]:
@@ -189,6 +206,7 @@ TABLES: dict[str, tuple[str, Callable[[Select], list[Cell]]]] = {
     "1": ("Table I. Correlation of learned with true return", correlations),
     "2": ("Table II. True return of policies", returns),
     "3": ("Table III. Hopper without one of the losses: true return of policies", ablations),
+    "4": ("Table IV. Franka Kitchen", kitchen),
     "5": ("Table V. Three strategies on HalfCheetah", three_strategies),
     "strategies": ("HalfCheetah with more and more demonstrators", growing_strategies),
     "ablations": ("Where the gain comes from", further_ablations),
@@ -277,7 +295,10 @@ def _to_grid(title: str, quantity: str, cells: Sequence[Cell]) -> Table:
 
 
 def _digits(cell: Cell) -> int:
-    return 3 if cell.quantity.startswith("pearson") else 0
+    if cell.quantity.startswith("pearson") or cell.quantity in _OUTCOMES:
+        return 3
+    # Returns of the kitchen are a hundredth of the others'.
+    return 2 if cell.domain == "franka_kitchen" else 0
 
 
 def _row_name(cell: Cell) -> str:
@@ -292,6 +313,8 @@ _QUANTITY_NAMES = {
     "return_last": "last",
     "env_steps_to_90_percent": "env steps to 90 %",
     "demo_return": "demonstrated",
+    "kettle_distance": "kettle from goal, m",
+    "success": "success",
 }
 
 
@@ -318,6 +341,8 @@ def _demonstrated(
     given = paper.THREE_STRATEGIES.get((target, "demonstrators"))
     if num_strategies == 2:
         given = paper.RETURNS.get((domain, target, "demonstrators"))
+    if domain == "franka_kitchen":
+        given = paper.KITCHEN.get((target, "demonstrators"))
     published = None if given is None else (given,)
     return Cell(domain, target, "demonstrators", "demo_return", found, published)
 

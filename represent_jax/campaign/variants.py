@@ -8,7 +8,8 @@ from represent_jax.errors import UsageError, unknown
 from represent_jax.methods.config import MethodConfig
 from represent_jax.methods.presets import make_config
 
-DOMAINS = ("hopper", "half_cheetah", "inverted_double_pendulum")
+GYM_DOMAINS = ("hopper", "half_cheetah", "inverted_double_pendulum")
+DOMAINS = (*GYM_DOMAINS, "franka_kitchen")
 
 # Of the eight demonstrators of HalfCheetah, how many are taken: the first ones.
 NUMS_STRATEGIES = (1, 2, 3, 5, 8)
@@ -49,7 +50,7 @@ _FROM_SCRATCH = (
 )
 
 # SSRR appears twice: the tables' task row is on merged demonstrations, their strategy rows are on
-# each strategy's own. Both are recorded as "ssrr"; their targets differ.
+# each strategy's own. Both are recorded as "ssrr"; their targets differ. So does BC, for Table IV.
 VARIANTS = {
     "represent": Variant("represent", "represent"),
     "ssrr": Variant("ssrr", "ssrr"),
@@ -57,6 +58,8 @@ VARIANTS = {
     "msrd": Variant("msrd", "msrd"),
     "drex": Variant("drex", "drex"),
     "bc": Variant("bc", "bc"),
+    "bc_strategy_1": Variant("bc", "bc", ("grouping=strategy_1",)),
+    "bc_strategy_2": Variant("bc", "bc", ("grouping=strategy_2",)),
     "bc_rnn": Variant("bc_rnn", "bc_rnn"),
     "no_reg": Variant("no_reg", "represent", ("regression.lambda_reg=0",)),
     "no_bcd": Variant("no_bcd", "represent", ("regression.lambda_bcd=0",)),
@@ -104,23 +107,35 @@ class TableRuns:
 
 
 TABLES = {
-    "1": TableRuns(DOMAINS, dict.fromkeys(_DECOMPOSING, _REWARDS) | {"airl": "airl_evaluation"}),
-    "2": TableRuns(DOMAINS, dict.fromkeys((*_DECOMPOSING, "bc", "bc_rnn"), _POLICIES)),
+    "1": TableRuns(
+        GYM_DOMAINS, dict.fromkeys(_DECOMPOSING, _REWARDS) | {"airl": "airl_evaluation"}
+    ),
+    "2": TableRuns(GYM_DOMAINS, dict.fromkeys((*_DECOMPOSING, "bc", "bc_rnn"), _POLICIES)),
     "3": TableRuns(
         ("hopper",),
         dict.fromkeys(("represent", "no_reg", "no_bcd", "ssrr", "ssrr_separate"), _POLICIES),
+    ),
+    "4": TableRuns(
+        ("franka_kitchen",),
+        dict.fromkeys(
+            (
+                *("represent", "ssrr", "ssrr_separate", "msrd"),
+                *("bc", "bc_strategy_1", "bc_strategy_2"),
+            ),
+            _POLICIES,
+        ),
     ),
     "5": TableRuns(("half_cheetah",), {"three_strategies": _POLICIES}),
     "strategies": TableRuns(
         ("half_cheetah",),
         {f"strategies_{num}": _POLICIES for num in NUMS_STRATEGIES},
     ),
-    "ablations": TableRuns(DOMAINS, dict.fromkeys(("represent", *ABLATIONS), _REWARDS)),
+    "ablations": TableRuns(GYM_DOMAINS, dict.fromkeys(("represent", *ABLATIONS), _REWARDS)),
     "figure_5": TableRuns(
         ("inverted_double_pendulum",),
         dict.fromkeys(("scratch", "ssrr_scratch", "ssrr_separate_scratch"), _POLICIES),
     ),
-    "cold": TableRuns(DOMAINS, dict.fromkeys(("represent", "cold"), _POLICIES)),
+    "cold": TableRuns(GYM_DOMAINS, dict.fromkeys(("represent", "cold"), _POLICIES)),
 }
 
 

@@ -29,3 +29,16 @@ def load_demonstrations(name_or_path: str | os.PathLike) -> Demonstrations:
     if not Path(name_or_path).exists():
         raise unknown("demonstrations", str(name_or_path), names())
     return load_file(name_or_path)
+
+
+def load_test(env_name: str, name_or_path: str | os.PathLike = "") -> Demonstrations | None:
+    """Loads unseen trajectories: those asked for, or the environment's own, None where none ship.
+
+    Raises:
+      UsageError: neither a name nor a file.
+      RepresentError: the file is not a whole file of demonstrations.
+    """
+    own = f"{env_name}_test"
+    if not name_or_path and own not in names():
+        return None
+    return load_demonstrations(name_or_path or own)

@@ -2,6 +2,7 @@
 
 The layout is that of the `imitation` library: T+1 observations and T actions, the last observation
 being the true final one; the true reward and the demonstrator's strategy are kept beside them.
+Actions and rewards may be missing: rewards are learned from states, and the true ones only judge.
 """
 
 import dataclasses
@@ -23,8 +24,8 @@ class Trajectory:
 
     Attributes:
         obs: observations, the final one included, float32 [T+1, obs_dim].
-        actions: executed actions, float32 [T, action_dim].
-        rewards: true rewards, float32 [T].
+        actions: executed actions, float32 [T, action_dim]; None where they are not known.
+        rewards: true rewards, float32 [T]; None where they are not known.
         terminated: whether the episode ended in a terminal state rather than at the time limit.
         strategy: number of the demonstrator, counted from 0.
 
@@ -34,26 +35,27 @@ class Trajectory:
     """
 
     obs: np.ndarray
-    actions: np.ndarray
-    rewards: np.ndarray
+    actions: np.ndarray | None
+    rewards: np.ndarray | None
     terminated: bool
     strategy: int
 
     def __post_init__(self):
         for name, rank in (("obs", 2), ("actions", 2), ("rewards", 1)):
-            object.__setattr__(self, name, _finite_float32(name, getattr(self, name), rank))
+            if name == "obs" or getattr(self, name) is not None:
+                object.__setattr__(self, name, _finite_float32(name, getattr(self, name), rank))
         object.__setattr__(self, "terminated", bool(self.terminated))
         object.__setattr__(self, "strategy", int(self.strategy))
-        if self.length < 1:
-            raise RepresentError("trajectory of zero length: it needs at least 1 action, has 0")
-        if len(self.obs) != self.length + 1:
+        if self.actions is not None and len(self.actions) and len(self.obs) != self.length + 1:
             raise RepresentError(
                 f"trajectory of {self.length} actions has {len(self.obs)} observations, "
                 f"it needs {self.length + 1}"
             )
-        if len(self.rewards) != self.length:
+        if self.length < 1:
+            raise RepresentError("trajectory of zero length: it needs at least 1 step, has 0")
+        if self.rewards is not None and len(self.rewards) != self.length:
             raise RepresentError(
-                f"trajectory of {self.length} actions has {len(self.rewards)} rewards, "
+                f"trajectory of {self.length} steps has {len(self.rewards)} rewards, "
                 f"it needs {self.length}"
             )
         if self.strategy < 0:
@@ -61,12 +63,18 @@ class Trajectory:
 
     @property
     def length(self) -> int:
-        """Number of actions T."""
-        return len(self.actions)
+        """Number of steps T."""
+        return len(self.obs) - 1 if self.actions is None else len(self.actions)
 
     @property
     def total_reward(self) -> float:
-        """Undiscounted true return."""
+        """Undiscounted true return.
+
+        Raises:
+            RepresentError: the rewards are missing.
+        """
+        if self.rewards is None:
+            raise RepresentError("a trajectory without rewards has no true return")
         return float(self.rewards.sum(dtype=np.float64))
 
 
@@ -80,8 +88,9 @@ class Demonstrations:
         metadata: where they come from; anything JSON can hold.
 
     Raises:
-        RepresentError: on construction, when there are none, dimensions disagree, strategies are
-            not exactly 0, ..., M-1, or JSON cannot hold the metadata.
+        RepresentError: on construction, when there are none, dimensions disagree, some of them lack
+            actions or rewards and others do not, strategies are not exactly 0, ..., M-1, or JSON
+            cannot hold the metadata.
     """
 
     env_name: str
@@ -92,13 +101,21 @@ class Demonstrations:
         object.__setattr__(self, "trajectories", tuple(self.trajectories))
         if not self.trajectories:
             raise RepresentError(f"demonstrations of {self.env_name}: no trajectories")
-        for name, dim in (("obs", self.obs_dim), ("actions", self.action_dim)):
+        first = self.trajectories[0]
+        for name in ("obs", "actions", "rewards"):
             for i, trajectory in enumerate(self.trajectories):
-                found = getattr(trajectory, name).shape[1]
-                if found != dim:
+                found, expected = getattr(trajectory, name), getattr(first, name)
+                if (found is None) != (expected is None):
+                    lacks, has = (i, 0) if found is None else (0, i)
+                    raise RepresentError(
+                        f"demonstrations of {self.env_name}: trajectory {lacks} has no {name}, "
+                        f"trajectory {has} has them; all need them, or none"
+                    )
+                if found is not None and found.shape[1:] != expected.shape[1:]:
                     raise RepresentError(
                         f"demonstrations of {self.env_name}: {name} of trajectory {i} have "
-                        f"{found} dimensions, those of trajectory 0 have {dim}"
+                        f"{found.shape[1]} dimensions, those of trajectory 0 have "
+                        f"{expected.shape[1]}"
                     )
         strategies = sorted({trajectory.strategy for trajectory in self.trajectories})
         if strategies != list(range(len(strategies))):
@@ -117,9 +134,19 @@ class Demonstrations:
         return self.trajectories[0].obs.shape[1]
 
     @property
-    def action_dim(self) -> int:
-        """Size of an action."""
-        return self.trajectories[0].actions.shape[1]
+    def action_dim(self) -> int | None:
+        """Size of an action, None where actions are missing."""
+        return self.trajectories[0].actions.shape[1] if self.has_actions else None
+
+    @property
+    def has_actions(self) -> bool:
+        """Whether the actions are known."""
+        return self.trajectories[0].actions is not None
+
+    @property
+    def has_rewards(self) -> bool:
+        """Whether the true rewards are known."""
+        return self.trajectories[0].rewards is not None
 
     @property
     def num_strategies(self) -> int:
@@ -131,7 +158,11 @@ class Demonstrations:
         return tuple(t for t in self.trajectories if t.strategy == strategy)
 
     def mean_return(self, strategy: int) -> float:
-        """Returns the mean true return of one demonstrator, counted from 0."""
+        """Returns the mean true return of one demonstrator, counted from 0.
+
+        Raises:
+            RepresentError: the rewards are missing.
+        """
         return float(np.mean([t.total_reward for t in self.of_strategy(strategy)]))
 
     def check_against(
@@ -157,10 +188,12 @@ class Demonstrations:
             ("observations", self.obs_dim, obs_dim),
             ("actions", self.action_dim, action_dim),
         ):
-            if found != expected:
+            if found is not None and found != expected:
                 raise RepresentError(
                     f"{where}: {name} have {found} dimensions, the environment's have {expected}"
                 )
+        if not self.has_actions:
+            return
         low, high = (np.broadcast_to(b, action_dim) for b in (action_low, action_high))
         for i, trajectory in enumerate(self.trajectories):
             below = trajectory.actions < low - _BOUND_TOLERANCE
@@ -179,16 +212,16 @@ class TrajectoryBatch(NamedTuple):
 
     Attributes:
         obs: observations [N, T+1, obs_dim]; past the end the final observation is repeated.
-        actions: executed actions [N, T, action_dim], zero past the end.
-        rewards: true rewards [N, T], zero past the end.
+        actions: executed actions [N, T, action_dim], zero past the end; None where missing.
+        rewards: true rewards [N, T], zero past the end; None where missing.
         mask: 1 while the episode runs, 0 past the end, float32 [N, T].
         strategy: number of the demonstrator, int32 [N].
         noise_level: probability with which an action was replaced by a random one, float32 [N].
     """
 
     obs: np.ndarray
-    actions: np.ndarray
-    rewards: np.ndarray
+    actions: np.ndarray | None
+    rewards: np.ndarray | None
     mask: np.ndarray
     strategy: np.ndarray
     noise_level: np.ndarray
@@ -200,7 +233,8 @@ def pad(
     """Stacks trajectories of any lengths up to the horizon.
 
     Args:
-        trajectories: N trajectories of equal dimensions, N >= 1.
+        trajectories: N trajectories of equal dimensions, N >= 1; all or none have actions, and
+            rewards.
         horizon: length T of the batch, in steps.
         noise_level: noise level of the trajectories, a number or [N].
 
@@ -217,23 +251,32 @@ def pad(
     pairs = list(zip(trajectories, missing, strict=True))
     return TrajectoryBatch(
         obs=np.stack([np.pad(t.obs, ((0, m), (0, 0)), mode="edge") for t, m in pairs]),
-        actions=np.stack([np.pad(t.actions, ((0, m), (0, 0))) for t, m in pairs]),
-        rewards=np.stack([np.pad(t.rewards, (0, m)) for t, m in pairs]),
+        actions=_stack_padded([t.actions for t in trajectories], missing),
+        rewards=_stack_padded([t.rewards for t in trajectories], missing),
         mask=np.stack([(np.arange(horizon) < t.length).astype(np.float32) for t, _ in pairs]),
         strategy=np.array([t.strategy for t in trajectories], np.int32),
         noise_level=np.broadcast_to(np.asarray(noise_level, np.float32), num).copy(),
     )
 
 
+def _stack_padded(rows: list[np.ndarray | None], missing: list[int]) -> np.ndarray | None:
+    if rows[0] is None:
+        return None
+    padded = zip(rows, missing, strict=True)
+    return np.stack([np.pad(x, ((0, m),) + ((0, 0),) * (x.ndim - 1)) for x, m in padded])
+
+
 def unpad(batch: TrajectoryBatch) -> tuple[Trajectory, ...]:
     """Returns the trajectories of a batch; those that stop before the horizon as terminated."""
-    obs, actions, rewards, mask, strategy, _ = (np.asarray(leaf) for leaf in batch)
+    obs, actions, rewards, mask, strategy, _ = (
+        None if leaf is None else np.asarray(leaf) for leaf in batch
+    )
     lengths = mask.sum(axis=1).astype(int)
     return tuple(
         Trajectory(
             obs=obs[i, : length + 1],
-            actions=actions[i, :length],
-            rewards=rewards[i, :length],
+            actions=None if actions is None else actions[i, :length],
+            rewards=None if rewards is None else rewards[i, :length],
             terminated=length < mask.shape[1],
             strategy=strategy[i],
         )
@@ -242,7 +285,13 @@ def unpad(batch: TrajectoryBatch) -> tuple[Trajectory, ...]:
 
 
 def returns(batch: TrajectoryBatch) -> np.ndarray:
-    """Returns the undiscounted true return of every trajectory [N]; works under jit."""
+    """Returns the undiscounted true return of every trajectory [N]; works under jit.
+
+    Raises:
+        RepresentError: the rewards are missing.
+    """
+    if batch.rewards is None:
+        raise RepresentError("trajectories without rewards have no true returns")
     return (batch.rewards * batch.mask).sum(axis=-1)
 
 

@@ -12,7 +12,9 @@ class Environment(base.Env):
     """Steps one task with one engine; no time limit, no auto-reset, no noise (see `Episode`).
 
     Actions are in [-1, 1] and are mapped linearly onto the actuators' control ranges, which for
-    Gym's tasks is the identity.
+    Gym's tasks is the identity, unless the task has a control law of its own.
+
+    Where the task has observation noise, the state's `info` holds `noise_key`.
 
     Attributes:
       task: the task.
@@ -53,7 +55,7 @@ class Environment(base.Env):
 
     @property
     def action_size(self) -> int:
-        return self.engine.model.nu
+        return self.task.action_dim or self.engine.model.nu
 
     @property
     def backend(self) -> str:
@@ -64,16 +66,30 @@ class Environment(base.Env):
         qpos, qvel = self.task.reset(rng, self._init_qpos)
         physics = self.engine.init(qpos, qvel, where)
         zero = jnp.zeros(())
-        return base.State(physics, self.task.observe(physics), zero, zero)
+        info = {}
+        if self.task.observation_noise is not None:
+            # Drawn aside, so that with and without noise episodes begin alike.
+            info["noise_key"] = jax.random.fold_in(rng, 1)
+        return self._observe(base.State(physics, zero, zero, zero, info=info))
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
         before = state.pipeline_state
-        after = self.engine.step(before, self._ctrl_center + self._ctrl_scale * action)
+        ctrl = self.task.control(state.obs, action, self._ctrl_center, self._ctrl_scale)
+        after = self.engine.step(before, ctrl)
         reward = self.task.reward(before, action, after, self.engine.dt)
         done = self.task.terminated(after) if self.terminates else jnp.zeros((), bool)
-        return state.replace(
+        state = state.replace(
             pipeline_state=after,
-            obs=self.task.observe(after),
             reward=reward,
             done=done.astype(jnp.float32),
         )
+        return self._observe(state)
+
+    def _observe(self, state: base.State) -> base.State:
+        obs = self.task.observe(state.pipeline_state)
+        if self.task.observation_noise is None:
+            return state.replace(obs=obs)
+        key, key_noise = jax.random.split(state.info["noise_key"])
+        noise = jax.random.uniform(key_noise, obs.shape, minval=-1.0, maxval=1.0)
+        obs = obs + jnp.asarray(self.task.observation_noise, jnp.float32) * noise
+        return state.replace(obs=obs, info=state.info | {"noise_key": key})

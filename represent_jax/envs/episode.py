@@ -63,7 +63,7 @@ class Episode(base.Env):
             "terminated": jnp.zeros((), bool),
             "truncated": jnp.zeros((), bool),
         }
-        return state.replace(info=info)
+        return state.replace(info=state.info | info)
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
         key, key_replace, key_uniform, key_reset = jax.random.split(state.info["key"], 4)
@@ -87,6 +87,7 @@ class Episode(base.Env):
             "terminated": terminated,
             "truncated": truncated,
         }
+        info = after.info | info
         after = after.replace(done=done.astype(jnp.float32), info=info)
         if not self.auto_reset:
             return after

@@ -3,15 +3,16 @@
 from collections.abc import Callable
 
 from represent_jax.envs.environment import Environment
+from represent_jax.envs.franka_kitchen import FrankaKitchen
 from represent_jax.envs.half_cheetah import HalfCheetah
 from represent_jax.envs.hopper import Hopper
 from represent_jax.envs.inverted_double_pendulum import InvertedDoublePendulum
 from represent_jax.envs.task import Task
 from represent_jax.errors import UsageError, unknown
-from represent_jax.physics import make_engine
+from represent_jax.physics import make_engine, resolve_backend
 
 _TASKS: dict[str, Callable[..., Task]] = {
-    task.name: task for task in (Hopper, HalfCheetah, InvertedDoublePendulum)
+    task.name: task for task in (Hopper, HalfCheetah, InvertedDoublePendulum, FrankaKitchen)
 }
 
 
@@ -48,7 +49,7 @@ def make_env(name: str, backend: str = "auto", **task_options) -> Environment:
         task = _TASKS[name](**task_options)
     except TypeError as error:
         raise UsageError(f"environment {name!r}: {error}") from error
-    engine = make_engine(
-        backend, task.load_model(), task.frame_skip, task.derived_fields, task.mjx_solver
-    )
+    backend = resolve_backend(backend)
+    model = task.load_light_model() if backend == "mjx" else task.load_model()
+    engine = make_engine(backend, model, task.frame_skip, task.derived_fields, task.mjx_solver)
     return Environment(task, engine)

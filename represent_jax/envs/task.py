@@ -7,6 +7,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from represent_jax.envs.keyboard import Keyboard
 from represent_jax.physics.engine import PhysicsState
@@ -25,6 +26,9 @@ class Task(abc.ABC):
       terminates: whether `terminated` ends episodes unless the user says otherwise.
       derived_fields: `mujoco.MjData` fields that observation, reward or termination look at.
       mjx_solver: solver settings of the `mjx` engine.
+      action_dim: entries of an action; None where there is one for each actuator.
+      observation_noise: half-width of the uniform noise on what is observed, `[obs_dim]`; None
+        where there is none.
     """
 
     name: str
@@ -33,10 +37,16 @@ class Task(abc.ABC):
     terminates: bool = False
     derived_fields: tuple[str, ...] = ()
     mjx_solver: MjxSolver = MjxSolver()
+    action_dim: int | None = None
+    observation_noise: np.ndarray | None = None
 
     @abc.abstractmethod
     def load_model(self) -> mujoco.MjModel:
         """Compiles the scene."""
+
+    def load_light_model(self) -> mujoco.MjModel:
+        """Compiles the scene for engines that few and simple geoms suit; often the same."""
+        return self.load_model()
 
     @abc.abstractmethod
     def reset(self, key: jax.Array, init_qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -49,6 +59,20 @@ class Task(abc.ABC):
         Returns:
           Positions `[nq]` and velocities `[nv]`.
         """
+
+    def control(
+        self, obs_t: jax.Array, action_t: jax.Array, center: jax.Array, scale: jax.Array
+    ) -> jax.Array:
+        """Returns the actuators' control, `[nu]`; by default what the action says, linearly.
+
+        Args:
+          obs_t: what was observed before the step, noise included, `[obs_dim]`.
+          action_t: in [-1, 1], `[action_dim]`.
+          center, scale: the middle and half the width of the actuators' ranges, `[nu]`; 0 and 1
+            where an actuator has none.
+        """
+        del obs_t
+        return center + scale * action_t
 
     @abc.abstractmethod
     def observe(self, physics: PhysicsState) -> jax.Array:
@@ -68,6 +92,16 @@ class Task(abc.ABC):
     def readings(self, physics: PhysicsState) -> dict[str, jax.Array]:
         """Returns figures that help a driver, each `[]`, by a name with its unit; often none."""
         del physics
+        return {}
+
+    def outcomes(self, obs: jax.Array) -> dict[str, jax.Array]:
+        """Returns what an episode came to beside its reward, each `[...]`; often nothing.
+
+        Args:
+          obs: all observations of the episode, `[..., T + 1, obs_dim]`; past its end the last one
+            is repeated.
+        """
+        del obs
         return {}
 
     def keyboard(self, model: mujoco.MjModel) -> Keyboard | None:

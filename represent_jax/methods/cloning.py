@@ -31,6 +31,11 @@ class BcMethodConfig(OneGroupConfig):
     method: str = "bc"
     bc: BcConfig = BcConfig()
 
+    @property
+    def needs_actions(self) -> str:
+        """Cloning is of actions."""
+        return f"method={self.method}"
+
 
 @dataclasses.dataclass(frozen=True)
 class BcRnnMethodConfig(OneGroupConfig):
@@ -42,6 +47,11 @@ class BcRnnMethodConfig(OneGroupConfig):
 
     method: str = "bc_rnn"
     bc_rnn: BcRnnConfig = BcRnnConfig()
+
+    @property
+    def needs_actions(self) -> str:
+        """Cloning is of actions."""
+        return f"method={self.method}"
 
 
 def plan_bc(

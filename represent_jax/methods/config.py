@@ -6,7 +6,7 @@ from typing import NamedTuple
 from represent_jax.config import require
 from represent_jax.data.trajectories import Demonstrations, Trajectory
 from represent_jax.envs import Environment, Episode
-from represent_jax.errors import RepresentError, unknown
+from represent_jax.errors import RepresentError, UsageError, unknown
 from represent_jax.stages import airl, policies
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.curve import CurveConfig
@@ -29,6 +29,8 @@ class MethodConfig:
       grouping: "separate" keeps strategies apart; "merged" takes all demonstrations for those of
         one; "strategy_1" and so on takes that strategy alone.
       demonstrations: name or file of the demonstrations; the environment's own if empty.
+      test: name or file of unseen trajectories, on which rewards are judged; the environment's own
+        if empty, none where none ship.
       horizon: environment steps of an episode; 0 is the environment's own.
       population: how members run together, see `methods.population`.
     """
@@ -41,6 +43,7 @@ class MethodConfig:
     num_strategies: int = 2
     grouping: str = "separate"
     demonstrations: str = ""
+    test: str = ""
     horizon: int = 0
     population: str = "auto"
 
@@ -82,6 +85,11 @@ class MethodConfig:
     def policy_names(self) -> tuple[str, ...]:
         """Names of the targets that a policy is trained for."""
         return self.target_names
+
+    @property
+    def needs_actions(self) -> str:
+        """What in these settings needs demonstrated actions; empty where states are enough."""
+        return ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,6 +148,13 @@ class RepresentConfig(MethodConfig):
         asked = self.policy_targets or self.target_names
         return tuple(name for name in self.target_names if name in asked)
 
+    @property
+    def needs_actions(self) -> str:
+        """Rewards that see actions; those of next states alone do without."""
+        if not self.airl.discriminator.state_only:
+            return "airl.discriminator.state_only=false"
+        return "regression.include_action=true" if self.regression.include_action else ""
+
 
 class Problem(NamedTuple):
     """What the method is given.
@@ -147,7 +162,7 @@ class Problem(NamedTuple):
     Attributes:
       env: episodes that reset themselves.
       demonstrations: of the strategies in use.
-      test: unseen trajectories; only evaluation looks at them.
+      test: unseen trajectories, with true rewards; only evaluation looks at them. May be none.
     """
 
     env: Episode
@@ -156,16 +171,26 @@ class Problem(NamedTuple):
 
 
 def make_problem(
-    config: MethodConfig, env: Environment, demonstrations: Demonstrations, test: Demonstrations
+    config: MethodConfig,
+    env: Environment,
+    demonstrations: Demonstrations,
+    test: Demonstrations | None = None,
 ) -> Problem:
     """Checks demonstrations and test trajectories against the environment and cuts them to size.
 
     Raises:
+      UsageError: actions are missing that the method needs, or the test's true rewards.
       RepresentError: they do not fit the environment, or too few strategies are demonstrated.
     """
     horizon = config.horizon or env.horizon
-    for data in (demonstrations, test):
+    for what, data in (("demonstrations", demonstrations), ("test trajectories", test)):
+        if data is None:
+            continue
         data.check_against(env.observation_size, env.action_size, -1.0, 1.0)
+        if config.needs_actions and not data.has_actions:
+            raise UsageError(f"{what} hold no actions, which {config.needs_actions} needs")
+    if test is not None and not test.has_rewards:
+        raise UsageError("test trajectories hold no true rewards, which are all they are for")
     if config.num_strategies > demonstrations.num_strategies:
         raise RepresentError(
             f"num_strategies: expected at most {demonstrations.num_strategies}, as many as are "
@@ -182,16 +207,15 @@ def make_problem(
     return Problem(
         Episode(env, horizon),
         dataclasses.replace(demonstrations, trajectories=tuple(_truncate(t, horizon) for t in own)),
-        tuple(_truncate(t, horizon) for t in test.trajectories),
+        tuple(_truncate(t, horizon) for t in test.trajectories) if test is not None else (),
     )
 
 
 def _truncate(t: Trajectory, horizon: int) -> Trajectory:
     if t.length <= horizon:
         return t
-    return Trajectory(
-        t.obs[: horizon + 1], t.actions[:horizon], t.rewards[:horizon], False, t.strategy
-    )
+    actions, rewards = (None if x is None else x[:horizon] for x in (t.actions, t.rewards))
+    return Trajectory(t.obs[: horizon + 1], actions, rewards, False, t.strategy)
 
 
 def strategy_names(num_strategies: int) -> tuple[str, ...]:

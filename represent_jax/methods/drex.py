@@ -60,6 +60,13 @@ class DrexConfig(OneGroupConfig):
             self.policies.start,
         )
 
+    @property
+    def needs_actions(self) -> str:
+        """Its own base is a clone."""
+        if self.base == "bc":
+            return "base=bc (base=airl does without)"
+        return "" if self.airl.discriminator.state_only else "airl.discriminator.state_only=false"
+
 
 def configure(settings: dict[str, Any]) -> dict[str, Any]:
     """Turns a preset's settings of stages into D-REX's: policies start from random networks."""

@@ -77,7 +77,10 @@ def transitions_of(demonstrations: Demonstrations) -> list[Transition]:
 
 
 def transitions(trajectories: tuple[Trajectory, ...]) -> Transition:
-    """Transitions of trajectories one after the other, without the true reward."""
+    """Transitions of trajectories one after the other, without the true reward.
+
+    `action_t` is None where actions are missing: a static fact, which stages branch on.
+    """
     discount = [np.ones(t.length, np.float32) for t in trajectories]
     for rows, t in zip(discount, trajectories, strict=True):
         rows[-1] = 0.0 if t.terminated else 1.0
@@ -85,7 +88,11 @@ def transitions(trajectories: tuple[Trajectory, ...]) -> Transition:
     nothing = np.zeros_like(discount_t)
     return Transition(
         obs_t=np.concatenate([t.obs[:-1] for t in trajectories]),
-        action_t=np.concatenate([t.actions for t in trajectories]),
+        action_t=(
+            None
+            if trajectories[0].actions is None
+            else np.concatenate([t.actions for t in trajectories])
+        ),
         next_obs_t=np.concatenate([t.obs[1:] for t in trajectories]),
         reward_t=nothing,
         discount_t=discount_t,

@@ -140,6 +140,7 @@ def _digest(trajectories: Sequence[Trajectory]) -> str:
     digest = hashlib.sha256()
     for t in trajectories:
         for array in (t.obs, t.actions, t.rewards):
-            digest.update(np.ascontiguousarray(array).tobytes())
+            missing = array is None
+            digest.update(b"missing" if missing else np.ascontiguousarray(array).tobytes())
         digest.update(f"{t.length} {t.terminated} {t.strategy}".encode())
     return digest.hexdigest()[:16]

@@ -4,6 +4,9 @@ A stage is written for one member. On an accelerator a population is one vmap. O
 small matrices of these networks do not fill two cores, so there the members run side by side,
 a thread for each, as instances of one compiled program: the same results member by member, and
 about twice the throughput of vmap on two cores.
+
+Where there are several devices, each runs the vmap of its own share of the members and talks to no
+other: see `methods.mesh`.
 """
 
 import functools
@@ -15,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from represent_jax.errors import unknown
+from represent_jax.methods import mesh as meshes
 
 MODES = ("auto", "threads", "vmap")
 
@@ -25,6 +29,7 @@ class Population:
     Attributes:
       inputs: what differs between members, one pytree for each, all of one structure.
       mode: "threads" or "vmap".
+      mesh: the devices that share the members of a vmap; None where one has them all.
     """
 
     def __init__(self, inputs: Sequence[Any], mode: str = "auto", axes_of: Callable | None = None):
@@ -32,7 +37,8 @@ class Population:
 
         Args:
           inputs: one pytree for each member.
-          mode: "threads", "vmap", or "auto": threads on CPU hosts, vmap elsewhere.
+          mode: "threads", "vmap", or "auto": threads on CPU hosts, vmap elsewhere and wherever
+            there are several devices.
           axes_of: from a member's state to its vmap axes; 0 for all leaves if None.
 
         Raises:
@@ -41,9 +47,11 @@ class Population:
         if mode not in MODES:
             raise unknown("population mode", mode, MODES)
         if mode == "auto":
-            mode = "threads" if jax.default_backend() == "cpu" else "vmap"
+            alone = jax.default_backend() == "cpu" and jax.device_count() == 1
+            mode = "threads" if alone else "vmap"
         self.inputs = list(inputs)
         self.mode = mode
+        self.mesh = meshes.mesh_for(len(self.inputs)) if mode == "vmap" else None
         self._axes_of = axes_of or functools.partial(jax.tree.map, lambda _: 0)
 
     def init(self, init: Callable[[jax.Array, Any], Any], key: jax.Array) -> Any:
@@ -52,13 +60,18 @@ class Population:
         if self.mode == "threads":
             pairs = list(zip(keys, self.inputs, strict=True))
             return _side_by_side(jax.jit(init).lower(*pairs[0]).compile(), pairs)
-        axes = self._axes_of(jax.eval_shape(init, keys[0], self.inputs[0]))
-        return jax.jit(jax.vmap(init, out_axes=axes))(keys, stack(self.inputs))
+        state = jax.eval_shape(init, keys[0], self.inputs[0])
+        axes = self._axes_of(state)
+        init_vmap = jax.vmap(init, out_axes=axes)
+        if self.mesh is None:
+            return jax.jit(init_vmap)(keys, stack(self.inputs))
+        program = meshes.shared(self.mesh, init_vmap, (0, 0), meshes.axis_of_leaves(axes, state))
+        return jax.jit(program)(*meshes.place(self.mesh, (keys, stack(self.inputs)), 0))
 
     def stepper(self, step: Callable[[Any, Any], tuple[Any, Any]]) -> Callable:
         """Makes `states -> (states, metrics)` of `step(state, inputs)`; states are donated.
 
-        Metrics come back with a leading member axis. Compiled at the first call.
+        Metrics come back with a leading member axis, on every device. Compiled at the first call.
         """
         if self.mode == "threads":
             jitted = jax.jit(step, donate_argnums=0)
@@ -76,24 +89,39 @@ class Population:
             return step_threads
         inputs = stack(self.inputs)
 
-        def step_vmap(states):
+        def step_vmap(states, inputs):
             axes = self._axes_of(states)
             return jax.vmap(step, in_axes=(axes, 0), out_axes=(axes, 0))(states, inputs)
 
-        return jax.jit(step_vmap, donate_argnums=0)
+        if self.mesh is None:
+            return jax.jit(lambda states: step_vmap(states, inputs), donate_argnums=0)
+        inputs = meshes.place(self.mesh, inputs, 0)
+
+        @functools.partial(jax.jit, donate_argnums=0)
+        def step_shared(states, inputs):
+            axes = meshes.axis_of_leaves(self._axes_of(states), states)
+            states, metrics = meshes.shared(self.mesh, step_vmap, (axes, 0), (axes, 0))(
+                states, inputs
+            )
+            return states, meshes.replicate(self.mesh, metrics)
+
+        def step_placed(states):
+            axes = meshes.axis_of_leaves(self._axes_of(states), states)
+            return step_shared(meshes.place(self.mesh, states, axes), inputs)
+
+        return step_placed
 
     def members(self, states: Any) -> list[Any]:
         """Takes the states of a population apart."""
         if self.mode == "threads":
             return list(states)
 
-        def absent(leaf):
-            return leaf is None
-
+        if self.mesh is not None:
+            states = meshes.fetch(self.mesh, states)
         # Axes may be absent, and so may parts of the state: both count as leaves.
-        leaves, structure = jax.tree.flatten(states, is_leaf=absent)
-        axes = jax.tree.broadcast(self._axes_of(states), states, is_leaf=absent)
-        axes = jax.tree.leaves(axes, is_leaf=absent)
+        leaves, structure = jax.tree.flatten(states, is_leaf=meshes.absent)
+        axes = meshes.axis_of_leaves(self._axes_of(states), states)
+        axes = jax.tree.leaves(axes, is_leaf=meshes.absent)
 
         def member(i):
             return [

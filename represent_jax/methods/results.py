@@ -1,5 +1,9 @@
 """What a run found: rewards and policies compared with the truth, for the report and the records.
 
+What the truth is not known of is left out: demonstrators without true rewards are not compared
+with, and without test trajectories nothing is said of unseen ones. Rollouts always have the
+environment's own reward.
+
 This is the only place where the true reward is looked at.
 """
 
@@ -30,10 +34,17 @@ Episodes = Callable[[jax.Array], TrajectoryBatch]
 
 def describe(config: MethodConfig, problem: Problem) -> dict[str, Any]:
     """What every run's results begin with."""
-    groups = [
-        [t.total_reward for t in problem.demonstrations.of_strategy(i)]
-        for i in range(problem.demonstrations.num_strategies)
-    ]
+    demonstrations = problem.demonstrations
+    groups = [demonstrations.of_strategy(i) for i in range(demonstrations.num_strategies)]
+    given = {
+        "actions": demonstrations.has_actions,
+        "rewards": demonstrations.has_rewards,
+        "test": bool(problem.test),
+    }
+
+    def over(statistic, group):
+        return float(statistic([t.total_reward for t in group])) if given["rewards"] else None
+
     return {
         "env": config.env,
         "preset": config.preset,
@@ -45,12 +56,13 @@ def describe(config: MethodConfig, problem: Problem) -> dict[str, Any]:
         "demonstrators": [
             {
                 "name": name,
-                "return_mean": float(np.mean(returns)),
-                "return_std": float(np.std(returns)),
-                "num": len(returns),
+                "return_mean": over(np.mean, group),
+                "return_std": over(np.std, group),
+                "num": len(group),
             }
-            for name, returns in zip(config.group_names, groups, strict=True)
+            for name, group in zip(config.group_names, groups, strict=True)
         ],
+        "missing": [what for what, there in given.items() if not there],
         **provenance(),
     }
 
@@ -60,7 +72,7 @@ def judge_airl(
 ) -> dict[str, Any]:
     """True returns of Phase 1's policies, and how well its rewards know the test trajectories."""
     env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
-    test = pad(problem.test, problem.env.horizon)
+    test = pad(problem.test, problem.env.horizon) if problem.test else None
 
     def one(key, policy, reward):
         def act(params, obs_t, key):
@@ -70,24 +82,22 @@ def judge_airl(
             return airl.reward(params, *transition, config.airl)
 
         batch = rollouts.rollout(env, act, policy, key, jnp.zeros(FINAL_EPISODES))
-        learned = rollouts.learned_returns(test, reward_fn, reward)
-        found = evaluation.correlate(rollouts.true_returns(test), learned)
+        found = None
+        if test is not None:
+            learned = rollouts.learned_returns(test, reward_fn, reward)
+            found = evaluation.correlate(rollouts.true_returns(test), learned)
         return jnp.mean(rollouts.true_returns(batch)), found
 
     keys = jax.random.split(key, problem.demonstrations.num_strategies)
     returns, found = jax.jit(jax.vmap(one))(keys, first.policy, first.reward)
-    demonstrated = [one["return_mean"] for one in describe(config, problem)["demonstrators"]]
-    return {
-        "airl": [
-            {
-                "return": float(value),
-                "ratio": float(value) / demonstrated[i],
-                "pearson_test": float(found.pearson[i]),
-                "spearman_test": float(found.spearman[i]),
-            }
-            for i, value in enumerate(returns)
-        ]
-    }
+    judged = [{"return": float(value)} for value in returns]
+    for i, one in enumerate(judged):
+        if problem.demonstrations.has_rewards:
+            one["ratio"] = one["return"] / problem.demonstrations.mean_return(i)
+        if found is not None:
+            one["pearson_test"] = float(found.pearson[i])
+            one["spearman_test"] = float(found.spearman[i])
+    return {"airl": judged}
 
 
 def noisy_groups(noisy: noise.NoisyData) -> dict[str, TrajectoryBatch]:
@@ -153,19 +163,19 @@ def judge_rewards(
     """Correlates learned with true returns, and saves the points for figures.
 
     Args:
-      problem: holds the demonstrations and the unseen test trajectories.
+      problem: holds the demonstrations and the unseen test trajectories, as far as given.
       noisy: the noisy rollouts that rewards were trained on, by name ("noisy_1", ...).
       learned: the rewards, by target.
       directory: where the points go.
     """
-    groups = {
-        "demonstrations": pad(problem.demonstrations.trajectories, problem.env.horizon),
-        "test": pad(problem.test, problem.env.horizon),
-        **noisy,
-    }
-    best_demonstration = max(t.total_reward for t in problem.demonstrations.trajectories)
+    demonstrations = problem.demonstrations.trajectories
+    groups = {}
+    if problem.demonstrations.has_rewards:
+        groups["demonstrations"] = pad(demonstrations, problem.env.horizon)
+    if problem.test:
+        groups["test"] = pad(problem.test, problem.env.horizon)
+    groups |= noisy
     true = {name: np.asarray(rollouts.true_returns(batch)) for name, batch in groups.items()}
-    above = true["test"] > best_demonstration
     results, scatter = {}, {}
     for name, learned_of in learned.items():
         found = {group: np.asarray(learned_of(batch)) for group, batch in groups.items()}
@@ -173,16 +183,19 @@ def judge_rewards(
             scatter[f"{name}/{group}/true"] = true[group]
             scatter[f"{name}/{group}/learned"] = found[group]
         results[name] = {
-            **_correlations("test", true, found, ["test"]),
+            **(_correlations("test", true, found, ["test"]) if problem.test else {}),
             **(_correlations("noisy", true, found, list(noisy)) if noisy else {}),
-            **_correlations("pooled", true, found, list(groups)),
-            "pearson_above_demonstrators": (
+            **(_correlations("pooled", true, found, list(groups)) if groups else {}),
+        }
+        if problem.test and problem.demonstrations.has_rewards:
+            above = true["test"] > max(t.total_reward for t in demonstrations)
+            results[name]["pearson_above_demonstrators"] = (
                 float(evaluation.pearson(true["test"][above], found["test"][above]))
                 if above.sum() >= 5
                 else None
-            ),
-        }
-    directory.save_arrays("scatter", scatter)
+            )
+    if scatter:
+        directory.save_arrays("scatter", scatter)
     return results
 
 
@@ -203,7 +216,7 @@ def judge_policies(
     log: Sequence[Mapping[str, Any]],
     directory: RunDirectory,
 ) -> dict[str, Any]:
-    """True return, learned return and style of policies; saves their learning curves.
+    """True return, learned return, style and the task's outcomes; saves learning curves.
 
     Args:
       key: PRNG key.
@@ -219,16 +232,15 @@ def judge_policies(
     """
     key_style, key = jax.random.split(key)
     share_of_styles = _style_judge(key_style, problem)
-    means = [
-        float(np.mean([t.total_reward for t in problem.demonstrations.of_strategy(i)]))
-        for i in range(problem.demonstrations.num_strategies)
-    ]
+    demonstrations = problem.demonstrations
+    means = None
+    if demonstrations.has_rewards:
+        means = [demonstrations.mean_return(i) for i in range(demonstrations.num_strategies)]
     results, curves = {}, {}
     for i, (name, episodes_of) in enumerate(episodes.items()):
         batch = episodes_of(jax.random.fold_in(key, i))
         true = np.asarray(rollouts.true_returns(batch))
         group = config.group_names.index(name) if name in config.group_names else None
-        base = float(np.mean(means)) if group is None else means[group]
         final = float(np.mean(true))
         path = {"env_steps": [line["step"] for line in log]} | {
             quantity: [line[quantity][i] for line in log]
@@ -246,10 +258,16 @@ def judge_policies(
             "learned_return_final": (
                 float(np.mean(learned[name](batch))) if name in learned else None
             ),
-            "demonstrators_return": base,
-            "ratio_to_demonstrators": final / base,
             "style_kept": None if group is None else float(shares[group]),
+            **{
+                quantity: float(np.mean(values))
+                for quantity, values in problem.env.unwrapped.task.outcomes(batch.obs).items()
+            },
         }
+        if means is not None:
+            base = float(np.mean(means)) if group is None else means[group]
+            results[name]["demonstrators_return"] = base
+            results[name]["ratio_to_demonstrators"] = final / base
     if log:
         directory.save_arrays("learning_curves", curves)
     return {"policies": results}

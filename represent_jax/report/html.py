@@ -138,6 +138,7 @@ def _notices(results: Mapping[str, Any]) -> str:
             "The demonstrations hold one strategy alone: there is nothing to decompose, and task "
             "and strategy reward may share what was learned in any way."
         )
+    notices += tables.missing(results)
     return "".join(f"<p class=notice>{_text(notice)}</p>" for notice in notices)
 
 

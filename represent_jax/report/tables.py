@@ -25,6 +25,21 @@ class Table:
     note: str
 
 
+_MISSING = {
+    "actions": "The demonstrations hold no actions: imitation began from random policies and "
+    "matched states alone.",
+    "rewards": "The demonstrations hold no true rewards: nothing here is compared with the "
+    "demonstrators. Rollouts and policies are judged by the environment's own reward.",
+    "test": "There are no unseen trajectories: how far the rewards hold beyond what they were "
+    "trained on is not judged.",
+}
+
+
+def missing(results: Mapping[str, Any]) -> list[str]:
+    """Returns what the run was not given, a sentence each that says what follows from it."""
+    return [text for what, text in _MISSING.items() if what in (results.get("missing") or ())]
+
+
 def targets(results: Mapping[str, Any]) -> list[str]:
     """Returns the names of the learned rewards: "task", "strategy_1", ..."""
     return list(results.get("targets") or ("task", *groups(results)))
@@ -100,7 +115,7 @@ def returns_table(results: Mapping[str, Any]) -> Table | None:
 
 def rewards_table(results: Mapping[str, Any]) -> Table | None:
     """Returns the correlations of learned with true return, or None without any."""
-    rewards = results.get("rewards") or {}
+    rewards = {name: found for name, found in (results.get("rewards") or {}).items() if found}
     if not rewards:
         return None
     keys = (
@@ -132,7 +147,8 @@ def summary(results: Mapping[str, Any]) -> str:
         results: what results.json holds; stages that are missing are left out.
     """
     tables = [returns_table(results), rewards_table(results)]
-    return "\n\n".join(to_text(table) for table in tables if table is not None)
+    parts = [to_text(table) for table in tables if table is not None]
+    return "\n\n".join([*parts, *missing(results)])
 
 
 def to_text(table: Table) -> str:

@@ -11,14 +11,14 @@ import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from represent_jax.data.atomic import replacing
 from represent_jax.errors import RepresentError
 from represent_jax.runs.directory import RunDirectory, open_run
 
 DONE, FAILED, BLOCKED = "done", "failed", "blocked"
-_MARK = "done.json"
+MARK = "done.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +45,34 @@ class Node:
         """Hash of kind, settings and inputs; the name plays no part."""
         told = [self.kind, self.settings, [node.hash for node in self.inputs]]
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class Engine(Protocol):
+    """Where nodes run.
+
+    Attributes:
+      slots: how many nodes it takes at once.
+    """
+
+    slots: int
+
+    def start(self, graph: "Graph", node: Node) -> None:
+        """Takes on a node whose inputs are done."""
+
+    def wait(self, graph: "Graph") -> tuple[Node, str | None]:
+        """Returns a node that has ended, done in the graph's folder, or not and why."""
+
+
+class InTurn:
+    """Runs nodes one after the other in this process, which keeps the outputs that it needs."""
+
+    slots = 1
+
+    def start(self, graph: "Graph", node: Node) -> None:
+        self._node = node
+
+    def wait(self, graph: "Graph") -> tuple[Node, str | None]:
+        return self._node, graph.make(self._node)
 
 
 class Graph:
@@ -93,43 +121,55 @@ class Graph:
 
     def seconds_in_all(self, node: Node) -> float:
         """What a node that is done took together with all that it depends on."""
-        behind: dict[str, Node] = {}
-
-        def gather(one: Node) -> None:
-            behind[one.hash] = one
-            for before in one.inputs:
-                gather(before)
-
-        gather(node)
-        return round(sum(self.seconds(one) for one in behind.values()), 1)
+        return round(sum(self.seconds(one) for one in with_inputs(node)), 1)
 
     def is_done(self, node: Node) -> bool:
         """Returns whether the node has its output."""
         return self.states.get(node.hash) == DONE
 
-    def run(self, report: Callable[["Graph", Node, str], None]) -> None:
+    def run(
+        self, report: Callable[["Graph", Node, str], None], engine: Engine | None = None
+    ) -> None:
         """Runs what is left; a node that fails blocks those behind it and stops no other.
 
         Args:
           report: called with the node and "running", and again with how it ended.
+          engine: where nodes run; in this process, one after the other, if None.
         """
-        for node in self.left:
-            if any(self.states.get(before.hash) != DONE for before in node.inputs):
-                self._end(node, BLOCKED, report)
-                continue
-            report(self, node, "running")
-            start = time.monotonic()
-            try:
-                self._outputs[node.hash] = node.run(self.directory(node), *self._inputs(node))
-            except (RepresentError, ArithmeticError, ValueError, RuntimeError) as error:
-                self.errors[node.hash] = f"{type(error).__name__}: {error}"
-                self._end(node, FAILED, report)
-                continue
-            seconds = round(time.monotonic() - start, 1)
-            with replacing(self._mark(node)) as temporary:
-                temporary.write_text(json.dumps({"name": node.name, "seconds": seconds}) + "\n")
-            self._end(node, DONE, report)
-            self._forget()
+        engine = engine or InTurn()
+        running: set[str] = set()
+        while self.left:
+            for node in self.left:
+                before = [self.states.get(one.hash) for one in node.inputs]
+                if FAILED in before or BLOCKED in before:
+                    self._end(node, BLOCKED, report)
+                elif (
+                    node.hash not in running
+                    and len(running) < engine.slots
+                    and all(state == DONE for state in before)
+                ):
+                    report(self, node, "running")
+                    running.add(node.hash)
+                    engine.start(self, node)
+            if running:
+                node, error = engine.wait(self)
+                running.remove(node.hash)
+                if error is not None:
+                    self.errors[node.hash] = error
+                self._end(node, DONE if error is None else FAILED, report)
+                self._forget()
+
+    def make(self, node: Node) -> str | None:
+        """Runs one node here and marks it as done; returns what went wrong, or None."""
+        start = time.monotonic()
+        try:
+            self._outputs[node.hash] = node.run(self.directory(node), *self._inputs(node))
+        except (RepresentError, ArithmeticError, ValueError, RuntimeError) as error:
+            return f"{type(error).__name__}: {error}"
+        seconds = round(time.monotonic() - start, 1)
+        with replacing(self._mark(node)) as temporary:
+            temporary.write_text(json.dumps({"name": node.name, "seconds": seconds}) + "\n")
+        return None
 
     def output(self, node: Node) -> Any:
         """Returns the output of a node that is done, from memory or from its folder."""
@@ -149,7 +189,7 @@ class Graph:
         return [self.output(before) for before in node.inputs]
 
     def _mark(self, node: Node) -> Path:
-        return self.folder / node.hash / _MARK
+        return self.folder / node.hash / MARK
 
     def _end(self, node: Node, state: str, report: Callable) -> None:
         self.states[node.hash] = state
@@ -159,3 +199,16 @@ class Graph:
         """Drops outputs that no node left needs at once."""
         needed = {before.hash for node in self.left for before in node.inputs}
         self._outputs = {key: value for key, value in self._outputs.items() if key in needed}
+
+
+def with_inputs(node: Node) -> list[Node]:
+    """A node and all that it depends on, each once."""
+    found: dict[str, Node] = {}
+
+    def gather(one: Node) -> None:
+        found[one.hash] = one
+        for before in one.inputs:
+            gather(before)
+
+    gather(node)
+    return list(found.values())

@@ -201,7 +201,8 @@ def append_results(
 def _figures(results: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
     """Yields target, quantity and value of every figure in a run's results."""
     for one in results["demonstrators"]:
-        yield one["name"], "demo_return", one["return_mean"]
+        if one["return_mean"] is not None:
+            yield one["name"], "demo_return", one["return_mean"]
     for one, imitation in zip(results["demonstrators"], results.get("airl", ()), strict=False):
         for name, value in imitation.items():
             if name != "ratio":

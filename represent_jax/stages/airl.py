@@ -36,7 +36,7 @@ class AirlConfig:
       env_steps: budget of each strategy.
       agent: the generator, "sac" or "ppo".
       cloning_updates: updates of behavioural cloning that the generator starts from; 0 starts it
-        from random networks.
+        from random networks, and so do demonstrations of states alone.
       noisy: whether training environments have the noise levels of SSRR (Noisy-AIRL).
       reward_scale: factor on f where it rewards the generator.
       reward_clip: bound on f where it rewards the generator.
@@ -107,7 +107,7 @@ def init(key: jax.Array, env: Episode, demonstrations: Transition, config: AirlC
     levels = jnp.resize(levels, (settings.num_envs,))
     start = jax.vmap(env.reset)(jax.random.split(key_reset, settings.num_envs), levels)
     policy = None
-    if config.cloning_updates:
+    if config.cloning_updates and demonstrations.action_t is not None:
         sizes = (env.observation_size, env.action_size)
         random = module.policy_of(module.init_learner(key_policy, *sizes, settings))
 
@@ -192,6 +192,8 @@ def _discriminate(key, state, agent, demonstrations, policy_rows, config):
     policy = module.policy_of(agent.learner)
 
     def log_prob(rows):
+        if rows.action_t is None:
+            return None
         log_prob_t = module.log_prob(policy, rows.obs_t, rows.action_t, settings)
         return discriminator.bounded_log_prob(log_prob_t, config.discriminator)
 

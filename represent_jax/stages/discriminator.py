@@ -88,12 +88,13 @@ class Rows(NamedTuple):
 
     Attributes:
       expert, policy: transitions of the demonstrations and of the policy.
-      log_prob_expert, log_prob_policy: bounded log pi(a|s) of their rows.
+      log_prob_expert, log_prob_policy: bounded log pi(a|s) of their rows; the former is None for
+        demonstrations of states alone.
     """
 
     expert: Transition
     policy: Transition
-    log_prob_expert: jax.Array
+    log_prob_expert: jax.Array | None
     log_prob_policy: jax.Array
 
 
@@ -109,11 +110,14 @@ def init(
 ) -> DiscriminatorState:
     """Draws g and h, and takes the inputs' statistics from `[num_transitions]` rows."""
     obs = demonstrations.obs_t
-    obs_dim, action_dim = obs.shape[-1], demonstrations.action_t.shape[-1]
+    obs_dim = obs.shape[-1]
+    input_dim = obs_dim
+    if not config.state_only:
+        input_dim += obs_dim + demonstrations.action_t.shape[-1]
     module, optimizer = _networks(config)
     key_g, key_h = jax.random.split(key)
     params = RewardParams(
-        g=module.init(key_g, jnp.zeros(obs_dim if config.state_only else 2 * obs_dim + action_dim)),
+        g=module.init(key_g, jnp.zeros(input_dim)),
         h=module.init(key_h, jnp.zeros(obs_dim)),
         mean=jnp.mean(obs, axis=0),
         # A floor, for observations that hardly move in the demonstrations.
@@ -183,6 +187,25 @@ def importance_weight(
     return jnp.exp(log_prob_t - noisy)
 
 
+def logits(f_expert: jax.Array, f_policy: jax.Array, rows: Rows) -> tuple[jax.Array, jax.Array]:
+    """f - log pi of demonstrations and of the policy, both `[...]`; f alone without actions.
+
+    Where demonstrated actions are missing, so is their log pi, and log pi in the policy's rows only
+    would tell the two apart whatever the states are. So it is left out of both. At its optimum f is
+    then the log-ratio of how often transitions are demonstrated and how often the policy makes them
+    (Torabi et al., 2018, https://arxiv.org/abs/1807.06158); it still leads the policy to where the
+    demonstrations are, and g still says which states these are. The importance weights of noisy
+    rows need log pi of the policy's own actions only, and keep it.
+
+    Args:
+      f_expert, f_policy: f of the rows.
+      rows: the rows.
+    """
+    if rows.log_prob_expert is None:
+        return f_expert, f_policy
+    return f_expert - rows.log_prob_expert, f_policy - rows.log_prob_policy
+
+
 def loss(
     params: RewardParams, rows: Rows, key: jax.Array, config: DiscriminatorConfig
 ) -> tuple[jax.Array, Metrics]:
@@ -194,8 +217,8 @@ def loss(
       key: PRNG key of the penalty's interpolation.
       config: settings.
     """
-    logits_expert_is_high = advantage(params, rows.expert, config) - rows.log_prob_expert
-    logits_policy = advantage(params, rows.policy, config) - rows.log_prob_policy
+    f_expert, f_policy = (advantage(params, of, config) for of in (rows.expert, rows.policy))
+    logits_expert_is_high, logits_policy = logits(f_expert, f_policy, rows)
     action_dim = rows.policy.action_t.shape[-1]
     weight = importance_weight(rows.log_prob_policy, rows.policy.noise_level_t, action_dim)
     cross_entropy = 0.5 * jnp.mean(jax.nn.softplus(-logits_expert_is_high))

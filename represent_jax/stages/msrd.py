@@ -32,7 +32,7 @@ from represent_jax.agents.sac import PolicyParams, SacConfig
 from represent_jax.config import require
 from represent_jax.envs.episode import Episode
 from represent_jax.stages.airl import AirlConfig
-from represent_jax.stages.discriminator import INPUT_CLIP, Rows, gradient_penalty
+from represent_jax.stages.discriminator import INPUT_CLIP, Rows, gradient_penalty, logits
 from represent_jax.types import Metrics, Params, Transition
 
 
@@ -43,7 +43,7 @@ class MsrdConfig:
     Attributes:
       env_steps: budget of each strategy.
       cloning_updates: updates of behavioural cloning that each generator starts from; 0 starts it
-        from random networks.
+        from random networks, and so do demonstrations of states alone.
       hidden_sizes: units of the hidden layers of R^0, R~_i and h_i.
       learning_rate: AdamW step size of R~_i and h_i.
       task_learning_rate: that of R^0, which makes one step in a training step.
@@ -191,7 +191,7 @@ def init(key: jax.Array, env: Episode, demonstrations: Transition, config: MsrdC
 def _init_agent(key, env, demonstrations, config):
     key_agent, key_policy, key_clone = jax.random.split(key, 3)
     policy = None
-    if config.cloning_updates:
+    if config.cloning_updates and demonstrations.action_t is not None:
         sizes = (env.observation_size, env.action_size)
         random = sac.policy_of(sac.init_learner(key_policy, *sizes, config.sac))
 
@@ -262,9 +262,8 @@ def loss(
       key: PRNG key of the penalty's interpolation.
       config: settings.
     """
-
-    logits_expert = advantage(own, rows.expert, config) - rows.log_prob_expert
-    logits_policy = advantage(own, rows.policy, config) - rows.log_prob_policy
+    f_expert, f_policy = (advantage(own, of, config) for of in (rows.expert, rows.policy))
+    logits_expert, logits_policy = logits(f_expert, f_policy, rows)
     outputs = zip(*(_parts(own, of, config) for of in (rows.expert, rows.policy)), strict=True)
     task_square, strategy_square = (jnp.mean(jnp.square(jnp.stack(part))) for part in outputs)
     cross_entropy = 0.5 * jnp.mean(jax.nn.softplus(-logits_expert))
@@ -384,6 +383,8 @@ def _sample_rows(agent, env, demonstrations, key, config):
     policy = sac.policy_of(agent.learner)
 
     def log_prob(rows):
+        if rows.action_t is None:
+            return None
         log_prob_t = sac.log_prob(policy, rows.obs_t, rows.action_t, config.sac)
         return jnp.clip(log_prob_t, -config.log_prob_clip, config.log_prob_clip)
 

@@ -193,7 +193,7 @@ def init(
 
 
 def inputs_of(
-    obs_t: jax.Array, action_t: jax.Array, next_obs_t: jax.Array, config: RegressionConfig
+    obs_t: jax.Array, action_t: jax.Array | None, next_obs_t: jax.Array, config: RegressionConfig
 ) -> jax.Array:
     """What a head sees: the state that the action led to, and on request what came before."""
     if not config.include_action:
@@ -337,9 +337,8 @@ def _sample_states(key: jax.Array, batch: TrajectoryBatch, config: RegressionCon
     draw = jax.random.uniform(key, shape) * cumulative[-1]
     flat = jnp.searchsorted(cumulative, draw, side="right")
     index, step = jnp.divmod(jnp.minimum(flat, weights.size - 1), batch.mask.shape[1])
-    return inputs_of(
-        batch.obs[index, step], batch.actions[index, step], batch.obs[index, step + 1], config
-    )
+    action_t = None if batch.actions is None else batch.actions[index, step]
+    return inputs_of(batch.obs[index, step], action_t, batch.obs[index, step + 1], config)
 
 
 def step(

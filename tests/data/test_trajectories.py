@@ -39,7 +39,7 @@ def test_trajectory_holds_float32_and_its_return():
     "changes, message",
     [
         ({"obs": np.zeros((3, 2))}, "3 actions has 3 observations, it needs 4"),
-        ({"rewards": np.zeros(2)}, "3 actions has 2 rewards, it needs 3"),
+        ({"rewards": np.zeros(2)}, "3 steps has 2 rewards, it needs 3"),
         ({"rewards": np.zeros((3, 1))}, "rewards of a trajectory have 2 axes, they need 1"),
         ({"obs": np.zeros(4)}, "obs of a trajectory have 1 axes, they need 2"),
         (

@@ -125,7 +125,9 @@ def test_names_are_known():
     assert set(NAMES) <= set(names())
     with pytest.raises(UsageError, match=r"unknown environment 'half_cheeta'.*half_cheetah"):
         make_env("half_cheeta")
-    with pytest.raises(UsageError, match=r"unknown environment 'ant'.*known are half_cheetah"):
+    with pytest.raises(
+        UsageError, match=r"unknown environment 'ant'.*known are franka_kitchen, half_cheetah"
+    ):
         make_env("ant")
     with pytest.raises(UsageError, match="unknown backend 'mjy'"):
         make_env("hopper", "mjy")

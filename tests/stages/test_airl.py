@@ -47,6 +47,24 @@ def test_either_generator_counts_its_steps_and_hands_on_a_policy(problem, agent)
     assert airl.reward(output.reward, obs, action, obs, config).shape == (5,)
 
 
+def test_states_alone_are_imitated_from_a_random_policy(problem):
+    config = SMOKE.airl
+    shown = transitions_of(problem.demonstrations)[0]
+    states = shown._replace(action_t=None)
+
+    def start(demonstrations, config):
+        key = jax.random.PRNGKey(0)
+        return jax.jit(lambda: airl.init(key, problem.env, demonstrations, config).average)()
+
+    random = start(shown, dataclasses.replace(config, cloning_updates=0))
+    for a, b in zip(*map(jax.tree.leaves, (start(states, config), random)), strict=True):
+        np.testing.assert_array_equal(a, b)
+    state = jax.jit(lambda key: airl.init(key, problem.env, states, config))(jax.random.PRNGKey(0))
+    train = jax.jit(lambda state: airl.train(state, problem.env, states, config, 2))
+    _, metrics = train(state)
+    assert all(bool(jnp.isfinite(value)) for value in metrics.values())
+
+
 def test_the_policy_handed_on_is_the_average(problem):
     rate = 0.25
     config = dataclasses.replace(SMOKE.airl, policy_average_rate=rate)

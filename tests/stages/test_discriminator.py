@@ -91,6 +91,22 @@ def test_loss_is_the_weighted_cross_entropy():
     assert float(metrics["gradient_penalty"]) == 0.0
 
 
+def test_without_demonstrated_actions_the_loss_is_that_of_f_alone():
+    expert, policy = (_transition(jax.random.PRNGKey(i)) for i in (0, 1))
+    noise = jnp.full(16, 0.25)
+    expert = expert._replace(action_t=None)
+    policy = policy._replace(noise_level_t=noise)
+    params = discriminator.init(jax.random.PRNGKey(2), expert, CONFIG).params
+    log_policy = jnp.linspace(-1.0, 1.0, 16)
+    rows = discriminator.Rows(expert, policy, None, log_policy)
+    loss, _ = discriminator.loss(params, rows, jax.random.PRNGKey(3), CONFIG)
+    f_expert, f_policy = (discriminator.advantage(params, of, CONFIG) for of in (expert, policy))
+    weight = discriminator.importance_weight(log_policy, noise, 2)
+    expected = -0.5 * jnp.mean(jnp.log(jax.nn.sigmoid(f_expert)))
+    expected -= 0.5 * jnp.mean(weight * jnp.log(1.0 - jax.nn.sigmoid(f_policy)))
+    np.testing.assert_allclose(loss, expected, rtol=1e-4)
+
+
 def test_discriminator_learns_to_tell_two_clouds_apart():
     key = jax.random.PRNGKey(0)
     expert, policy = _transition(key, 256), _transition(jax.random.PRNGKey(9), 256)

@@ -95,6 +95,16 @@ def _assert_close(found, expected):
     )
 
 
+def test_without_demonstrated_actions_log_pi_is_left_out_of_both_halves():
+    rows = _rows((2, 2, 16))
+    states = rows._replace(expert=rows.expert._replace(action_t=None), log_prob_expert=None)
+    zero = np.zeros((2, 2, 16), np.float32)
+    zeros = rows._replace(log_prob_expert=zero, log_prob_policy=zero)
+    state = _state()
+    update = _jit(lambda rows: msrd.update_rewards(state, rows, jax.random.PRNGKey(3), CONFIG)[0])
+    _assert_close(update(states), update(zeros))
+
+
 # Linear networks have the same gradient everywhere, so that the penalty has a closed form.
 @pytest.mark.parametrize(("hidden_sizes", "penalty"), [((8,), 0.0), ((), 0.5)])
 def test_loss_in_closed_form(hidden_sizes, penalty):

@@ -1,0 +1,5 @@
+"""Franka Kitchen: an arm moves a kettle from one burner to another."""
+
+from represent_jax.envs.franka_kitchen.task import FrankaKitchen
+
+__all__ = ["FrankaKitchen"]

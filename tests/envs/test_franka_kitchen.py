@@ -1,0 +1,209 @@
+"""The kitchen against its source and C MuJoCo, its light scene, its keys.
+
+gymnasium-robotics' own environment stops in its constructor on current MuJoCo, after the model and
+all constants are there; what is there is what the tests compare with.
+"""
+
+import contextlib
+import functools
+import importlib.util
+import warnings
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from brax.envs import base
+
+import represent_jax as rj
+from represent_jax.envs import Episode, make_env
+from represent_jax.envs.franka_kitchen import FrankaKitchen, scene
+from represent_jax.envs.franka_kitchen.task import KETTLE_GOAL, OBSERVATION_NOISE
+from represent_jax.errors import RepresentError
+from represent_jax.physics import PhysicsState
+
+
+@functools.cache
+def make_source():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from gymnasium_robotics.envs.franka_kitchen.kitchen_env import KitchenEnv
+
+        source = KitchenEnv.__new__(KitchenEnv)
+        with contextlib.suppress(AssertionError):
+            source.__init__()
+    return source
+
+
+@functools.cache
+def make_kitchen(noisy=False):
+    return make_env("franka_kitchen", "mujoco", noisy=noisy)
+
+
+@functools.cache
+def demonstrated_states():
+    """Positions, velocities and actions of a push, while the kettle moves."""
+    demonstration = rj.load_demonstrations("franka_kitchen").of_strategy(0)[0]
+    obs, actions = demonstration.obs[:-1], demonstration.actions
+    moving = np.flatnonzero(np.linalg.norm(obs[:, 53:55], axis=1) > 0.005)
+    chosen = moving[:: max(1, len(moving) // 40)]
+    obs = obs[chosen]
+    qpos = np.hstack([obs[:, :9], obs[:, 18:39]])
+    qvel = np.hstack([obs[:, 9:18], obs[:, 39:59]])
+    return jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(actions[chosen])
+
+
+def step_from(env, qpos, qvel, actions, compiler_options=None):
+    """One step of many scenes from given states."""
+
+    @functools.partial(jax.jit, compiler_options=compiler_options)
+    @jax.vmap
+    def step(qpos, qvel, action):
+        physics = env.engine.init(qpos, qvel)
+        zero = jnp.zeros(())
+        return env.step(base.State(physics, env.task.observe(physics), zero, zero), action)
+
+    return step(qpos, qvel, actions)
+
+
+def test_start_and_layout_are_the_sources():
+    source, env = make_source(), make_kitchen()
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    start = source.robot_env.init_qpos
+    expected = np.concatenate([start[:9], np.zeros(9), start[9:], np.zeros(20)])
+    np.testing.assert_allclose(state.obs, expected, rtol=1e-6)
+    assert (env.observation_size, env.action_size, env.horizon) == (59, 9, 500)
+    assert env.engine.dt == pytest.approx(source.robot_env.dt) == pytest.approx(0.08)
+
+
+def test_a_step_is_that_of_the_unedited_model():
+    """Control law and substeps of the source's own robot, from states of a demonstration."""
+    robot, env = make_source().robot_env, make_kitchen()
+    qpos, qvel, _ = demonstrated_states()
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1.5, 1.5, (len(qpos), 9)).astype(np.float32)
+    after = step_from(env, qpos, qvel, actions)
+    expected = []
+    for q, v, action in zip(np.float64(qpos), np.float64(qvel), actions, strict=True):
+        mujoco.mj_resetData(robot.model, robot.data)
+        robot.set_state(q, v)
+        robot.data.qacc_warmstart[:] = 0.0
+        robot._last_robot_qpos = q[:9]
+        wanted = robot.act_mid + np.clip(action, -1.0, 1.0) * robot.act_rng
+        target = robot._ctrl_position_limits(robot._ctrl_velocity_limits(wanted))
+        np.testing.assert_allclose(env.task.control(q, action, None, None), target, atol=1e-6)
+        robot.do_simulation(target, robot.frame_skip)
+        q, v = robot.data.qpos, robot.data.qvel
+        expected.append(np.concatenate([q[:9], v[:9], q[9:], v[9:]]))
+    error = np.abs(after.obs - np.stack(expected)) / np.maximum(1.0, np.abs(expected))
+    assert error.max() <= 1e-4
+    distance = np.linalg.norm(after.obs[:, 32:35] - KETTLE_GOAL, axis=1)
+    np.testing.assert_allclose(after.reward, -distance, rtol=1e-5)
+
+
+def test_noise_is_the_sources_and_reaches_the_control():
+    robot, env = make_source().robot_env, make_kitchen(noisy=True)
+    amplitudes = [
+        0.01 * robot.robot_pos_noise_amp[:9],
+        0.01 * robot.robot_vel_noise_amp[:9],
+        0.0005 * robot.robot_pos_noise_amp[8:],
+        0.0005 * robot.robot_vel_noise_amp[9:],
+    ]
+    np.testing.assert_allclose(OBSERVATION_NOISE, np.concatenate(amplitudes))
+    episode = Episode(env, horizon=2)
+    state = jax.jit(episode.reset)(jax.random.PRNGKey(0))
+    step = jax.jit(episode.step)
+    seen = []
+    for _ in range(3):
+        true = env.task.observe(state.pipeline_state)
+        seen.append((state.obs - true) / OBSERVATION_NOISE)
+        state = step(state, jnp.zeros(9))
+    seen = np.stack(seen)
+    # Float32 has about 1e-7 left of the small noise on what is large.
+    assert np.all(np.abs(seen) <= 1.01) and np.abs(seen).max() > 0.9
+    assert np.all(seen[0, :18] != seen[1, :18]) and np.all(seen[1, :18] != seen[2, :18])
+
+
+def test_64_light_scenes_step_under_jit_and_push_the_kettle_nearly_as_the_full_one():
+    """One step from each state of a push: MJX's light scene against C MuJoCo's whole kitchen."""
+    qpos, qvel, actions = (jnp.resize(x, (64, x.shape[1])) for x in demonstrated_states())
+    light = make_env("franka_kitchen", "mjx")
+    full = step_from(make_kitchen(), qpos, qvel, actions)
+    keep_q, keep_v = np.r_[0:9, 23:30], np.r_[0:9, 23:29]
+    # XLA's fused loops compute a link's pose anew for every link behind it.
+    options = {"xla_cpu_use_fusion_emitters": False}
+    found = step_from(light, qpos[:, keep_q], qvel[:, keep_v], actions, options)
+    assert found.obs.shape == full.obs.shape == (64, 59)
+    np.testing.assert_array_equal(found.obs[:, 39:53], 0.0)  # speeds of what does not move
+    error = 1e3 * np.linalg.norm(full.obs[:, 32:35] - found.obs[:, 32:35], axis=1)
+    assert np.median(error) <= 1.0 and error.max() <= 3.0, (np.median(error), error.max())
+    joints = np.abs(full.obs[:, :9] - found.obs[:, :9]).max(axis=1)
+    assert np.median(joints) <= 4e-3 and joints.max() <= 0.02, (np.median(joints), joints.max())
+
+
+def test_the_light_scene_keeps_masses_and_what_collides():
+    full, light = scene.load_full(), scene.load_light()
+    assert (light.nq, light.nv, light.nu, light.neq) == (16, 15, 9, 0)
+    for i in range(1, light.nbody):
+        name = light.body(i).name
+        if "panda" in name or "kettle" in name:
+            j = full.body(name).id
+            for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos"):
+                np.testing.assert_allclose(getattr(light, field)[i], getattr(full, field)[j])
+    kinds = {mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_PLANE}
+    assert light.ngeom == 14 and set(light.geom_type) <= set(map(int, kinds))
+
+
+def test_outcomes():
+    obs = np.zeros((4, 3, 59), np.float32)
+    obs[:, :, 35] = 1.0
+    obs[:, -1, 32:35] = KETTLE_GOAL
+    obs[:, -1, 33] += [0.0, 0.04, 0.06, 0.0]
+    obs[3, -1, 35:39] = [np.cos(0.3), np.sin(0.3), 0.0, 0.0]  # leans by 0.6 rad
+    found = FrankaKitchen().outcomes(obs)
+    np.testing.assert_allclose(found["kettle_distance"], [0.0, 0.04, 0.06, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(found["success"], [1.0, 1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("keys", "axis", "sign"), [("w", 1, 1), ("s", 1, -1), ("a", 0, -1), ("d", 0, 1), ("q", 2, 1)]
+)
+def test_keys_move_the_hand_and_only_that_way(keys, axis, sign):
+    env = make_kitchen()
+    model = env.engine.model
+    keyboard, data = env.task.keyboard(model), mujoco.MjData(model)
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(0))
+
+    def hand(state):
+        data.qpos[:] = state.pipeline_state.qpos
+        mujoco.mj_kinematics(model, data)
+        return data.site("end_effector").xpos.copy()
+
+    start = hand(state)
+    for _ in range(10):
+        state = step(state, keyboard.action(frozenset(keys), state.pipeline_state))
+    moved = hand(state) - start
+    assert sign * moved[axis] == pytest.approx(0.15 * 0.8, rel=0.15)
+    assert np.abs(np.delete(moved, axis)).max() < 0.02
+
+
+def test_the_hand_stays_where_it_is_and_the_fingers_where_they_were_told():
+    env = make_kitchen()
+    keyboard = env.task.keyboard(env.engine.model)
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    physics = state.pipeline_state
+    fingers = [keyboard.action(frozenset(keys), physics)[-1] for keys in ("", " ", " ", "", " ")]
+    assert fingers == [1.0, -1.0, -1.0, -1.0, 1.0]
+    keyboard.reset()
+    step = jax.jit(env.step)
+    for _ in range(20):
+        state = step(state, keyboard.action(frozenset(), state.pipeline_state))
+    assert np.abs(state.obs[:7] - physics.qpos[:7]).max() < 0.02
+    assert isinstance(physics, PhysicsState)
+
+
+def test_missing_assets_are_named(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(RepresentError, match=r"pip install 'represent_jax\[kitchen\]'"):
+        make_env("franka_kitchen", "mujoco")
