@@ -57,6 +57,10 @@ class InvertedDoublePendulum(Task):
         _, tip_height = _tip(physics)
         return tip_height <= 1.0
 
+    def readings(self, physics: PhysicsState) -> dict[str, jax.Array]:
+        _, tip_height = _tip(physics)
+        return {"height of the tip, m": tip_height}
+
     def keyboard(self, model: mujoco.MjModel) -> DirectKeyboard:
         pushes = (
             ("arrowleft", "push the cart to the left", 0, -0.5),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from represent_jax.errors import RepresentError, UsageError
+from represent_jax.physics import offscreen
 from represent_jax.report import video
 
 MODEL = """
@@ -30,7 +31,7 @@ def gl():
     """Skips where nothing can draw."""
     pytest.importorskip("imageio_ffmpeg")
     try:
-        video._gl_context(64, 64).free()
+        offscreen.gl_context(64, 64).free()
     except RepresentError as error:
         pytest.skip(str(error))
 
@@ -49,11 +50,11 @@ def test_a_video_has_one_frame_a_position(model, gl, tmp_path):
 def test_the_drawing_follows_the_position(model, gl):
     data = mujoco.MjData(model)
     columns = []
-    with video._renderer(model, (160, 128)) as draw:
+    with offscreen.renderer(model, (160, 128)) as draw:
         for x in (-0.5, 0.5):
             data.qpos[:] = x
             mujoco.mj_forward(model, data)
-            frame = draw(data, 0)
+            frame = draw(data, offscreen.find_camera(model, 0))
             assert frame.shape == (128, 160, 3)
             red = frame[..., 0].astype(int) > frame[..., 1].astype(int) + 40
             columns.append(np.argwhere(red)[:, 1].mean())
