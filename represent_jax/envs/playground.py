@@ -67,6 +67,11 @@ class Adapted(base.Env):
     def backend(self) -> str:
         return self._backend
 
+    def outcomes(self, obs: jax.Array) -> dict[str, jax.Array]:
+        """What episodes came to beside their reward: of other libraries' nothing is known."""
+        del obs
+        return {}
+
     def reset(self, rng: jax.Array, where: jax.Array | bool = True) -> base.State:
         """Draws an initial state; `where` is not used, since there is no way to skip a reset."""
         del where

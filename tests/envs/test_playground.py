@@ -62,6 +62,7 @@ class Drift:
 def test_the_whole_state_is_renewed_by_a_reset():
     env = Episode(Adapted(Drift(), "drift", horizon=10))
     assert (env.observation_size, env.action_size, env.terminates) == (2, 1, True)
+    assert env.unwrapped.outcomes(jnp.zeros((1, 11, 2))) == {}
     start = jax.jit(env.reset)(jax.random.PRNGKey(0))
 
     def step(state, _):
