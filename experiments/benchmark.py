@@ -357,9 +357,10 @@ def _scaling() -> None:
         )
         lines.append((axis, *cells))
     print(
-        "Growth, HalfCheetah's sizes (MiB: arrays of the compiled program, without MuJoCo's own):"
+        "Growth at HalfCheetah's sizes; a round is one run of each size. MiB are the arguments, "
+        "outputs and\ntemporary arrays of the compiled program, without MuJoCo's own and the "
+        "process around them.\n"
     )
-    print()
     _print_table(heads, table)
     _print_table(("what grows", "seconds, line through what was measured", "MiB"), lines)
 
