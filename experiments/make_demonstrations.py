@@ -1,6 +1,9 @@
-"""Makes the demonstrations and test trajectories that ship with the package.
+"""Makes the demonstrations and test trajectories that ship with the package, or a robot's own.
 
 python -m experiments.make_demonstrations --env=half_cheetah --out=represent_jax/data/shipped
+python -m experiments.make_demonstrations --env=franka_kitchen --override push.fast_share=0.3
+python -m experiments.make_demonstrations --env=my_robots:Swimmer --out=data \
+    --override diayn.num_skills=2 --override target_returns=20,30
 """
 
 import os
@@ -15,7 +18,6 @@ from represent_jax import config as configs
 from represent_jax.data.npz import save_demonstrations
 from represent_jax.data.trajectories import Demonstrations, Trajectory
 from represent_jax.envs import Environment, make_env
-from represent_jax.errors import unknown
 from represent_jax.methods import demonstrators, operators
 from represent_jax.stages import style
 
@@ -31,9 +33,8 @@ _OPERATORS = operators.OperatorsConfig()
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     known = {**demonstrators.DEMONSTRATORS, _OPERATORS.env: _OPERATORS}
-    if _ENV.value not in known:
-        raise unknown("environment", _ENV.value, known)
-    config = configs.apply_overrides(known[_ENV.value], _OVERRIDE.value)
+    config = known.get(_ENV.value) or _robots_own(_ENV.value)
+    config = configs.apply_overrides(config, _OVERRIDE.value)
     out = Path(_OUT.value)
     os.makedirs(out, exist_ok=True)
     driven = isinstance(config, operators.OperatorsConfig)
@@ -43,6 +44,18 @@ def main(argv: list[str]) -> None:
     if _PART.value in ("both", "test"):
         make = _drive_test_set if driven else _make_test_set
         make(config, out / f"{config.env}_test.npz")
+
+
+def _robots_own(name: str) -> demonstrators.DemonstratorConfig:
+    """Settings to begin with for an environment of which nothing ships."""
+    make_env(name, _BACKEND.value)  # An unknown name is an error of its own.
+    configs.require(
+        any(override.partition("=")[0].strip() == "target_returns" for override in _OVERRIDE.value),
+        "override",
+        f"target_returns=..., the return wanted of each skill, which nobody chose for {name}",
+        _OVERRIDE.value,
+    )
+    return demonstrators.DemonstratorConfig(env=name)
 
 
 def _make_demonstrations(config: demonstrators.DemonstratorConfig, path: Path) -> None:

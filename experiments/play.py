@@ -8,7 +8,8 @@ from absl import flags
 
 from experiments import launch
 from represent_jax.api import load_config, load_policy
-from represent_jax.envs import make_env
+from represent_jax.envs import Environment, make_env
+from represent_jax.errors import UsageError
 from represent_jax.report import showcase, video
 
 _RUN = flags.DEFINE_string("run", None, "Run folder.", required=True)
@@ -23,6 +24,8 @@ def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     policy = load_policy(_RUN.value, _TARGET.value)
     env = make_env(load_config(_RUN.value).env)
+    if not isinstance(env, Environment):
+        raise UsageError(f"{env.name}: only tasks on the engines of this package can be shown")
     video.check_available()
     qpos, rewards = showcase.motion(env, policy, jax.random.PRNGKey(_SEED.value), _STEPS.value)
     model = env.engine.model

@@ -20,7 +20,7 @@ from represent_jax.methods.plan import execute, stage_names
 from represent_jax.methods.presets import make_config
 from represent_jax.methods.registry import METHODS, find_method
 from represent_jax.report import html, showcase, tables
-from represent_jax.runs import open_run
+from represent_jax.runs import open_run, processes
 from represent_jax.runs.records import append_results
 from represent_jax.runs.tracking import WandbTracker
 
@@ -98,6 +98,8 @@ def _run(config: MethodConfig, out: str) -> None:
         results = execute(config, problem, stages, run, _UNTIL.value)
         if results is None:
             print(f"{out}: done until {_UNTIL.value}; --resume goes on")
+            return
+        if not processes.is_first():
             return
         if _VIDEOS.value:
             showcase.make(

@@ -61,6 +61,10 @@ class Environment(base.Env):
     def backend(self) -> str:
         return self.engine.name
 
+    def outcomes(self, obs: jax.Array) -> dict[str, jax.Array]:
+        """What episodes came to beside their reward, see `Task.outcomes`."""
+        return self.task.outcomes(obs)
+
     def reset(self, rng: jax.Array, where: jax.Array | bool = True) -> base.State:
         """Draws an initial state; `where` says whether the result will be used."""
         qpos, qvel = self.task.reset(rng, self._init_qpos)

@@ -58,6 +58,10 @@ class InvertedDoublePendulum(Task):
         _, tip_height = _tip(physics)
         return tip_height <= 1.0
 
+    def readings(self, physics: PhysicsState) -> dict[str, jax.Array]:
+        _, tip_height = _tip(physics)
+        return {"height of the tip, m": tip_height}
+
     def qpos_of(self, model: mujoco.MjModel, obs: np.ndarray, dt: float) -> np.ndarray:
         del model, dt
         return np.column_stack([obs[:, 0], np.arctan2(obs[:, 1:3], obs[:, 3:5])])

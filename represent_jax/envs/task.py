@@ -89,6 +89,11 @@ class Task(abc.ABC):
         del physics
         return jnp.zeros((), bool)
 
+    def readings(self, physics: PhysicsState) -> dict[str, jax.Array]:
+        """Returns figures that help a driver, each `[]`, by a name with its unit; often none."""
+        del physics
+        return {}
+
     def outcomes(self, obs: jax.Array) -> dict[str, jax.Array]:
         """Returns what an episode came to beside its reward, each `[...]`; often nothing.
 

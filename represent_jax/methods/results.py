@@ -261,7 +261,7 @@ def judge_policies(
             "style_kept": None if group is None else float(shares[group]),
             **{
                 quantity: float(np.mean(values))
-                for quantity, values in problem.env.unwrapped.task.outcomes(batch.obs).items()
+                for quantity, values in problem.env.unwrapped.outcomes(batch.obs).items()
             },
         }
         if means is not None:

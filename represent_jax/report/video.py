@@ -1,25 +1,19 @@
 """Videos of a motion, rendered off-screen."""
 
 import contextlib
-import copy
-import importlib
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from represent_jax.data.atomic import replacing
-from represent_jax.errors import RepresentError, unknown
-
-_LIBRARIES = ("egl", "osmesa", "glfw")
+from represent_jax.errors import RepresentError
+from represent_jax.physics import offscreen
 
 
 def render(
@@ -70,11 +64,11 @@ def render_beside(
         RepresentError, UsageError: as `render`.
     """
     motions = [_checked(model, qpos) for qpos in motions]
-    camera = _camera_id(model, camera)
+    view = offscreen.find_camera(model, camera)
     ffmpeg = _ffmpeg()
     path = Path(path)
     width, height = size
-    with _renderer(model, size) as draw, replacing(path) as temporary:
+    with offscreen.renderer(model, size) as draw, replacing(path) as temporary:
         with _encoder(ffmpeg, temporary, fps, (width * len(motions), height)) as send:
             data = mujoco.MjData(model)
             frame = np.empty((height, width * len(motions), 3), np.uint8)
@@ -82,7 +76,7 @@ def render_beside(
                 for panel, qpos in enumerate(motions):
                     data.qpos[:] = qpos[min(step, len(qpos) - 1)]
                     mujoco.mj_forward(model, data)
-                    frame[:, panel * width : (panel + 1) * width] = draw(data, camera)
+                    frame[:, panel * width : (panel + 1) * width] = draw(data, view)
                 send(frame)
     return path
 
@@ -94,7 +88,7 @@ def check_available() -> None:
         RepresentError: ffmpeg or a GL library is missing.
     """
     _ffmpeg()
-    _gl_context(64, 64).free()
+    offscreen.gl_context(64, 64).free()
 
 
 def _checked(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
@@ -138,70 +132,3 @@ def _encoder(
             log.seek(0)
             reason = log.read().decode(errors="replace").strip().rpartition("\n")[2]
             raise RepresentError(f"{path}: ffmpeg failed ({reason or f'exit status {status}'})")
-
-
-def _camera_id(model: mujoco.MjModel, camera: str | int) -> int:
-    if isinstance(camera, str):
-        names = [model.camera(i).name for i in range(model.ncam)]
-        if camera not in names:
-            raise unknown("camera", camera, names or ["-1 (free)"])
-        return names.index(camera)
-    if not -1 <= camera < model.ncam:
-        raise unknown("camera", str(camera), [str(i) for i in range(-1, model.ncam)])
-    return camera
-
-
-@contextlib.contextmanager
-def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> Iterator[Any]:
-    """Yields a function from (data, camera) to a frame [height, width, 3], good until the next."""
-    model = copy.copy(model)
-    width, height = size
-    model.vis.global_.offwidth, model.vis.global_.offheight = size
-    gl = _gl_context(width, height)
-    try:
-        gl.make_current()
-        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
-        scene = mujoco.MjvScene(model, maxgeom=max(1000, 4 * model.ngeom))
-        options, view = mujoco.MjvOption(), mujoco.MjvCamera()
-        mujoco.mjv_defaultFreeCamera(model, view)
-        frame, area = np.zeros((height, width, 3), np.uint8), mujoco.MjrRect(0, 0, width, height)
-
-        def draw(data: mujoco.MjData, camera: int) -> np.ndarray:
-            if camera >= 0:
-                view.fixedcamid, view.type = camera, mujoco.mjtCamera.mjCAMERA_FIXED
-            mujoco.mjv_updateScene(
-                model, data, options, None, view, mujoco.mjtCatBit.mjCAT_ALL, scene
-            )
-            mujoco.mjr_render(area, scene, context)
-            mujoco.mjr_readPixels(frame, None, area, context)
-            return frame[::-1]
-
-        yield draw
-        context.free()
-    finally:
-        gl.free()
-
-
-def _gl_context(width: int, height: int) -> Any:
-    """Returns a context of the first GL library that works; MUJOCO_GL names the only one to try.
-
-    MuJoCo's own choice is made on its import, and is a window where there may be no display.
-    """
-    asked = os.environ.get("MUJOCO_GL", "").lower()
-    reasons = []
-    for library in [asked] if asked in _LIBRARIES else _LIBRARIES:
-        if library == "glfw" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-            reasons.append("glfw: no display")
-            continue
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                return importlib.import_module(f"mujoco.{library}").GLContext(width, height)
-        except Exception as error:  # Each library fails in its own way where it is not installed.
-            reasons.append(f"{library}: {str(error).splitlines()[0] if str(error) else error!r}")
-    raise RepresentError(
-        "videos need an OpenGL library that draws off-screen, and none was found "
-        f"({'; '.join(reasons)}); install EGL (Debian: libegl1) or OSMesa (libosmesa6), "
-        "and set MUJOCO_GL=egl or MUJOCO_GL=osmesa to choose one"
-    )

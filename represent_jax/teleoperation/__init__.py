@@ -1,0 +1,1 @@
+"""A robot driven from a page in a browser, and what was driven recorded as demonstrations."""
