@@ -10,6 +10,8 @@ RUN := $(VENV)/bin/python -m
 UV ?= uv
 DEMO_OUT ?= runs/demo
 EXTRAS :=
+# Of the extras, those that `make test` needs; tests of the others are skipped there.
+TESTED := dev,hdf5,imitation,kitchen,minari,teleop,video
 
 # A name on the PATH may be a shim that fails, or a Python without venv: only running it tells.
 PROBE := import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info < (3, 14))
@@ -71,12 +73,12 @@ $(VENV)/.installed: $(VENV)/.created pyproject.toml constraints.txt
 	$(install)
 	@touch $@
 
-$(VENV)/.installed-dev: EXTRAS := [dev,video]
+$(VENV)/.installed-dev: EXTRAS := [$(TESTED)]
 $(VENV)/.installed-dev: $(VENV)/.created pyproject.toml constraints.txt
 	$(install)
 	@touch $@ $(VENV)/.installed
 
-$(VENV)/.installed-extras: EXTRAS := [dev,video,ray,sb3]
+$(VENV)/.installed-extras: EXTRAS := [$(TESTED),ray,sb3]
 $(VENV)/.installed-extras: $(VENV)/.created pyproject.toml constraints.txt
 	$(install)
 	@touch $@ $(VENV)/.installed $(VENV)/.installed-dev

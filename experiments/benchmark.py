@@ -1,4 +1,4 @@
-"""Measures the engines, MJX's solver settings and populations of agents on this machine.
+"""Measures engines, MJX's solver settings, populations of agents and growth on this machine.
 
     python -m experiments.benchmark --sections=engines --num_envs=64,256
 
@@ -23,7 +23,7 @@ import numpy as np
 from absl import flags
 from mujoco import batch as mujoco_batch
 
-from experiments import launch
+from experiments import benchmark_scaling, launch
 from represent_jax.agents import sac
 from represent_jax.config import config_hash, to_dict
 from represent_jax.envs import Environment, Episode, make_env
@@ -34,7 +34,7 @@ from represent_jax.types import Transition
 
 State = Any  # Brax's
 
-_SECTIONS = ("engines", "solver", "population")
+_SECTIONS = ("engines", "solver", "population", "scaling")
 _LOOP, _MUJOCO, _EPISODE, _MJX, _GYM = (
     "mujoco.batch, Python loop",
     "mujoco, jit(scan)",
@@ -59,6 +59,17 @@ _SOLVER = flags.DEFINE_list(
     "solver",
     ["1/4", "2/4", "3/4", "4/2", "4/4", "4/8", "4/4/sparse", "8/8", "100/50"],
     "MJX settings to compare: iterations/line search[/sparse]; the last is the ratios' base.",
+)
+_SCALING = flags.DEFINE_multi_string(
+    "scaling",
+    [
+        "seeds:1,2,3,4:40",
+        "environments:32,64,128,256:4096",
+        "strategies:1,2,3,4:16",
+        "demonstrations:5,10,20,40:400",
+        "horizon:50,100,200,400:1000",
+    ],
+    "What grows, as axis:measured sizes:extrapolated sizes.",
 )
 _RECORD = flags.DEFINE_string("record", None, "File to append the results to, one JSON a line.")
 
@@ -102,6 +113,8 @@ def main(argv: list[str]) -> None:
         _solver_settings()
     if "population" in _SECTION.value:
         _population()
+    if "scaling" in _SECTION.value:
+        _scaling()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"Peak resident memory of this process: {peak:.2f} GiB.")
 
@@ -322,6 +335,33 @@ def _population() -> None:
     width = "x".join(str(units) for units in config.hidden_sizes)
     print(f"SAC updates, batch {config.batch_size}, networks {width}, HalfCheetah's sizes:\n")
     _print_table(heads, table)
+
+
+def _scaling() -> None:
+    """How time and memory grow along each axis."""
+    heads = ("what grows", "work", "number", "seconds", "MiB", "from")
+    table, lines = [], []
+    for axis, sizes, far in [benchmark_scaling.parse(text) for text in _SCALING.value]:
+        rows, seconds, mib = benchmark_scaling.measure(axis, sizes, far, _REPEATS.value)
+        for row in rows:
+            told = "measured" if row.measured else "extrapolated"
+            cells = (f"{row.size:,}", f"{row.seconds:.3f}", f"{row.mib:,.1f}", told)
+            table.append((row.axis, row.work, *cells))
+            if row.measured:
+                preset = f"{row.axis}={row.size}"
+                _record("half_cheetah", "scaling", "seconds", row.seconds, preset)
+                _record("half_cheetah", "scaling", "mib", row.mib, preset)
+        cells = (
+            f"{line.start:.3g} + {line.slope:.3g} n, R² {line.r_squared:.3f}"
+            for line in (seconds, mib)
+        )
+        lines.append((axis, *cells))
+    print(
+        "Growth, HalfCheetah's sizes (MiB: arrays of the compiled program, without MuJoCo's own):"
+    )
+    print()
+    _print_table(heads, table)
+    _print_table(("what grows", "seconds, line through what was measured", "MiB"), lines)
 
 
 def _measure(rows: list[Row]) -> None:

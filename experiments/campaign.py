@@ -1,6 +1,6 @@
 """Runs everything behind the paper's tables: methods, domains, seeds; each stage once.
 
-python -m experiments.campaign --tables=1,2,3,5 --seeds=5 --preset=paper
+python -m experiments.campaign --tables=1,2,3,4,5 --seeds=5 --preset=paper
 python -m experiments.campaign --tables=1 --domains=hopper --seeds=1 --preset=smoke --dry_run
 python -m experiments.campaign --engine=ray --address=auto --seeds=5 --preset=paper
 

@@ -1,4 +1,14 @@
-"""What all launchers share: one-line errors, and quiet libraries."""
+"""What all launchers share: one-line errors, quiet libraries, several processes for one program.
+
+On a cluster that tells JAX of its processes (Slurm, Open MPI, a TPU pod) `--distributed` will do:
+
+    srun python -m experiments.represent --env=hopper --distributed --out=/shared/run
+
+Elsewhere each process is told where the first one listens, how many there are and which it is:
+
+    python -m experiments.represent --out=/shared/run --distributed \\
+        --coordinator=host:1234 --num_processes=2 --process=0
+"""
 
 import sys
 from collections.abc import Callable
@@ -8,6 +18,10 @@ from absl import app, flags, logging
 from represent_jax.errors import RepresentError
 
 _TRACEBACK = flags.DEFINE_bool("traceback", False, "Show where an error came from.")
+_DISTRIBUTED = flags.DEFINE_bool("distributed", False, "Be one of several processes of a run.")
+_COORDINATOR = flags.DEFINE_string("coordinator", "", "Host and port of the first process.")
+_NUM_PROCESSES = flags.DEFINE_integer("num_processes", 0, "Number of processes.")
+_PROCESS = flags.DEFINE_integer("process", -1, "Number of this process, from 0.")
 
 
 def run(main: Callable[[list[str]], None]) -> None:
@@ -18,6 +32,10 @@ def run(main: Callable[[list[str]], None]) -> None:
 
 def _guarded(main: Callable[[list[str]], None], argv: list[str]) -> None:
     try:
+        if _DISTRIBUTED.value:
+            from represent_jax.runs import processes
+
+            processes.join(_COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS.value)
         main(argv)
     except RepresentError as error:
         if _TRACEBACK.value:

@@ -1,6 +1,7 @@
 """Makes the demonstrations and test trajectories that ship with the package.
 
 python -m experiments.make_demonstrations --env=half_cheetah --out=represent_jax/data/shipped
+python -m experiments.make_demonstrations --env=franka_kitchen --override push.fast_share=0.3
 """
 
 import os

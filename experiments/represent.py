@@ -20,7 +20,7 @@ from represent_jax.methods.plan import execute
 from represent_jax.methods.presets import make_config
 from represent_jax.methods.registry import METHODS, find_method
 from represent_jax.report import html, tables
-from represent_jax.runs import open_run
+from represent_jax.runs import open_run, processes
 from represent_jax.runs.records import append_results
 
 _ENV = flags.DEFINE_string("env", "half_cheetah", "Environment.")
@@ -83,6 +83,8 @@ def _run(config: MethodConfig, out: str) -> None:
         results = execute(config, problem, stages, run, _UNTIL.value)
         if results is None:
             print(f"{out}: done until {_UNTIL.value}; --resume goes on")
+            return
+        if not processes.is_first():
             return
         page = html.write_report(run.path)
     print(tables.summary(results))

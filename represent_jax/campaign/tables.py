@@ -266,14 +266,23 @@ def to_table(title: str, cells: Sequence[Cell]) -> Table:
 
 
 def to_grids(title: str, cells: Sequence[Cell]) -> list[Table]:
-    """The cells at a glance: a table for each quantity, a column for each method."""
+    """The cells at a glance: a table for each quantity, a column for each method.
+
+    Demonstrators have no quantity but their return, and stand in the first column of every table.
+    """
+    shown = [cell for cell in cells if cell.method == "demonstrators"]
+    measured = [cell for cell in cells if cell.method != "demonstrators"]
     return [
-        _to_grid(title, quantity, [cell for cell in cells if cell.quantity == quantity])
-        for quantity in dict.fromkeys(cell.quantity for cell in cells)
+        _to_grid(title, quantity, shown, [cell for cell in measured if cell.quantity == quantity])
+        for quantity in dict.fromkeys(cell.quantity for cell in measured)
     ]
 
 
-def _to_grid(title: str, quantity: str, cells: Sequence[Cell]) -> Table:
+def _to_grid(
+    title: str, quantity: str, demonstrated: Sequence[Cell], measured: Sequence[Cell]
+) -> Table:
+    rows = {_row_name(cell) for cell in measured}
+    cells = [*(cell for cell in demonstrated if _row_name(cell) in rows), *measured]
     methods = list(dict.fromkeys(cell.method for cell in cells))
     shown: dict[str, dict[str, str]] = {}
     for cell in cells:
@@ -282,7 +291,7 @@ def _to_grid(title: str, quantity: str, cells: Sequence[Cell]) -> Table:
         if cell.paper:
             text += f" ({_plus_minus(*cell.paper, digits=digits)})"
         shown.setdefault(_row_name(cell), {})[cell.method] = text
-    seeds = sorted({cell.found.num for cell in cells})
+    seeds = sorted({cell.found.num for cell in measured})
     counted = f"{seeds[0]}" if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
     return Table(
         title=f"{title}: {_QUANTITY_NAMES[quantity]}",

@@ -1,7 +1,11 @@
-"""Environments by name."""
+"""Environments by name, and by the place of a class that nobody registered."""
 
+import importlib
 from collections.abc import Callable
 
+from brax.envs import base
+
+from represent_jax.envs import playground
 from represent_jax.envs.environment import Environment
 from represent_jax.envs.franka_kitchen import FrankaKitchen
 from represent_jax.envs.half_cheetah import HalfCheetah
@@ -32,24 +36,45 @@ def register(make_task: Callable[..., Task], name: str) -> None:
     _TASKS[name] = make_task
 
 
-def make_env(name: str, backend: str = "auto", **task_options) -> Environment:
+def make_env(name: str, backend: str = "auto", **task_options) -> base.Env:
     """Makes a Brax environment by name.
 
     Args:
-      name: a registered task, such as "half_cheetah".
+      name: a registered task, such as "half_cheetah"; "module:Class" of a `Task` that Python can
+        import, such as "my_robots:Swimmer"; or "playground:Name" of a MuJoCo Playground
+        environment, such as "playground:CartpoleBalance".
       backend: "mujoco" (C, for CPU hosts), "mjx" (XLA, for accelerators) or "auto".
       **task_options: passed to the task, such as `terminates=False`.
 
+    Returns:
+      An `Environment`, or what `envs.playground` makes.
+
     Raises:
-      UsageError: unknown environment, backend or option.
+      UsageError: unknown environment, backend or option, or an extra that is not installed.
     """
-    if name not in _TASKS:
+    source, _, inner = name.partition(":")
+    if source == "playground" and inner:
+        return playground.make(inner, backend, **task_options)
+    make_task = _TASKS.get(name) or (_imported(name) if inner else None)
+    if make_task is None:
         raise unknown("environment", name, names())
     try:
-        task = _TASKS[name](**task_options)
+        task = make_task(**task_options)
     except TypeError as error:
         raise UsageError(f"environment {name!r}: {error}") from error
     backend = resolve_backend(backend)
     model = task.load_light_model() if backend == "mjx" else task.load_model()
     engine = make_engine(backend, model, task.frame_skip, task.derived_fields, task.mjx_solver)
     return Environment(task, engine)
+
+
+def _imported(name: str) -> Callable[..., Task]:
+    """Finds the task of a "module:Class"."""
+    module, _, attribute = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"environment {name!r}: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, Task)):
+        raise UsageError(f"environment {name!r}: expected a class of envs.Task, found {found!r}")
+    return found

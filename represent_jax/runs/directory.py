@@ -8,6 +8,8 @@ arrays/<name>.npz    plot data
 findings/<stage>.json what a stage found
 results.json         what the run found
 figures/ report.html
+
+Of several processes that run one program, the first writes and all read: see `runs.processes`.
 """
 
 import json
@@ -27,7 +29,7 @@ from represent_jax import config as configs
 from represent_jax.data.atomic import disk_errors, replacing
 from represent_jax.data.npz import load_arrays
 from represent_jax.errors import RepresentError, UsageError
-from represent_jax.runs import checkpoint
+from represent_jax.runs import checkpoint, processes
 from represent_jax.runs.tensorboard import ScalarLog
 
 FORMAT_VERSION = 1
@@ -68,13 +70,16 @@ class RunDirectory:
 
     def is_done(self, stage: str) -> bool:
         """Returns whether the stage's output is saved."""
-        return checkpoint.is_whole(self._checkpoints(stage) / "output")
+        return processes.agreed(checkpoint.is_whole(self._checkpoints(stage) / "output"))
 
     def save_output(self, stage: str, output: Any) -> None:
         """Saves the stage's final output, after which it is done and its progress is dropped."""
-        checkpoint.save(self._checkpoints(stage) / "output", output)
-        shutil.rmtree(self._checkpoints(stage) / "progress", ignore_errors=True)
-        self._close_scalar_log(stage)
+        output = processes.whole(output)
+        if processes.is_first():
+            checkpoint.save(self._checkpoints(stage) / "output", output)
+            shutil.rmtree(self._checkpoints(stage) / "progress", ignore_errors=True)
+            self._close_scalar_log(stage)
+        processes.wait()
 
     def load_output(self, stage: str, example: Tree) -> Tree:
         """Returns the stage's output, bit for bit.
@@ -92,6 +97,9 @@ class RunDirectory:
 
     def save_progress(self, stage: str, step: int, state: Any) -> None:
         """Saves the state of a stage under way; the state saved before stays, all others go."""
+        state = processes.whole(state)
+        if not processes.is_first():
+            return
         newest = self._checkpoints(stage) / "progress" / f"{step:012d}"
         checkpoint.save(newest, state)
         # A later step is a broken one that was skipped, or there would be no way to this one.
@@ -106,15 +114,20 @@ class RunDirectory:
         Raises:
             RepresentError: the saved state has another structure, shape or type than the example.
         """
+        found = None
         for folder in self._progress(stage):
             try:
-                return int(folder.name), checkpoint.load(folder, example)
+                found = int(folder.name), checkpoint.load(folder, example)
+                break
             except checkpoint.BrokenCheckpoint as error:
                 logging.warning("%s: going on from the checkpoint before it", error)
-        return None
+        processes.wait()  # The first process may drop what others still read.
+        return found
 
     def log(self, stage: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Logs the metrics of a stage; arrays as lists, and numbers that are not finite as null."""
+        if not processes.is_first():
+            return
         values = {name: plain(value) for name, value in metrics.items()}
         line = json.dumps({"stage": stage, "step": step, **values, "time": round(time.time(), 3)})
         with disk_errors(self.path / "metrics.jsonl"):
@@ -137,6 +150,8 @@ class RunDirectory:
 
     def rewind_log(self, stage: str, step: int) -> None:
         """Drops what the stage logged after a step, to be logged again."""
+        if not processes.is_first():
+            return
         self._close_scalar_log(stage)
         self._purge_steps[stage] = step + 1
         lines = [line for line in self.read_log() if line["stage"] != stage or line["step"] <= step]
@@ -145,7 +160,7 @@ class RunDirectory:
 
     def has_findings(self, stage: str) -> bool:
         """Returns whether what the stage found is saved."""
-        return self._findings(stage).is_file()
+        return processes.agreed(self._findings(stage).is_file())
 
     def save_findings(self, stage: str, findings: Mapping[str, Any]) -> None:
         """Writes findings/<stage>.json; arrays as lists, numbers that are not finite as null."""
@@ -173,8 +188,11 @@ class RunDirectory:
 
     def save_arrays(self, name: str, arrays: Mapping[str, Any]) -> None:
         """Saves named arrays, such as the points of a figure, as arrays/<name>.npz."""
-        with replacing(self._arrays(name)) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, **{key: np.asarray(array) for key, array in arrays.items()})
+        if processes.is_first():
+            values = {key: np.asarray(array) for key, array in arrays.items()}
+            with replacing(self._arrays(name)) as temporary, open(temporary, "wb") as file:
+                np.savez_compressed(file, **values)
+        processes.wait()
 
     def load_arrays(self, name: str) -> dict[str, np.ndarray]:
         """Returns the named arrays of arrays/<name>.npz.
@@ -227,7 +245,8 @@ def open_run(path: str | os.PathLike, config: Any, resume: bool = False) -> RunD
     values = dict(config) if isinstance(config, Mapping) else configs.to_dict(config)
     if path.exists() and not path.is_dir():
         raise UsageError(f"{path}: a file, expected a folder for the run")
-    if path.is_dir() and any(not entry.name.startswith(".") for entry in path.iterdir()):
+    begun = path.is_dir() and any(not entry.name.startswith(".") for entry in path.iterdir())
+    if processes.agreed(begun):
         if not resume:
             raise UsageError(f"{path}: not empty; resume the run in it, or choose another folder")
         _check_same_config(path, load_config_json(path), json.loads(json.dumps(values)))
@@ -293,8 +312,10 @@ def _at(values: Any, dotted_key: str) -> str:
 
 
 def _write_json(path: Path, value: Any) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2) + "\n")
+    if processes.is_first():
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(value, indent=2) + "\n")
+    processes.wait()
 
 
 def _read_json(path: Path) -> Any:

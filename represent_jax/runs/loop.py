@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from represent_jax.errors import RepresentError
+from represent_jax.runs import processes
 from represent_jax.runs.directory import RunDirectory
 from represent_jax.runs.progress import progress
 
@@ -63,7 +64,7 @@ def advance(
             if run is not None:
                 run.log(stage, units, metrics)
             bar.update(units_per_chunk, (describe or _first_scalars)(metrics))
-            due = time.monotonic() - saved_at >= checkpoint_seconds
+            due = processes.agreed(time.monotonic() - saved_at >= checkpoint_seconds)
             if run is not None and due and units < total:
                 run.save_progress(stage, units, state)
                 saved_at = time.monotonic()

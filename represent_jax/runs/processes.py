@@ -29,6 +29,8 @@ def join(address: str = "", num_processes: int = 0, process: int = -1) -> None:
       RepresentError: the processes do not find each other.
     """
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    # It would catch SIGTERM and go on; a run that is ended so should end, and can be resumed.
+    jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(
             address or None, num_processes or None, process if process >= 0 else None

@@ -86,9 +86,11 @@ def test_grids_have_a_table_a_quantity_and_a_column_a_method():
     records = [_record("task", "return_best", seed, 1000.0 + 10 * seed) for seed in range(3)]
     records += [_record("task", "return_best", 0, 7.0, method="drex")]
     records += [_record("strategy_1", "return_final", 0, 5.0)]
+    records += [_record("strategy_1", "demo_return", 0, 4.0)]
     highest, kept = tables.to_grids(*tables.make("2", records, "quick"))
     assert highest.title.endswith("highest") and kept.title.endswith("kept")
     assert highest.columns == ("", "REPRESENT", "D-REX")
     assert highest.rows == (("Hopper, task", "1,010 +- 10 (1,692)", "7 (1)"),)
-    assert kept.rows == (("Hopper, strategy 1", "5"),)
+    assert kept.columns == ("", "Demonstrators", "REPRESENT")
+    assert kept.rows == (("Hopper, strategy 1", "4 (1,198)", "5"),)
     assert "(1 to 3)" in highest.note and "(1)" in kept.note

@@ -23,6 +23,10 @@ from represent_jax.envs.franka_kitchen.task import KETTLE_GOAL, OBSERVATION_NOIS
 from represent_jax.errors import RepresentError
 from represent_jax.physics import PhysicsState
 
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("gymnasium_robotics") is None, reason="needs the extra 'kitchen'"
+)
+
 
 @functools.cache
 def make_source():

@@ -1,6 +1,7 @@
 """Operators press keys as people do, and what they demonstrated ships."""
 
 import dataclasses
+import importlib.util
 
 import numpy as np
 import pytest
@@ -35,6 +36,9 @@ def test_an_operator_thinks_pauses_and_differs_by_seed():
     assert runs[0][0] == frozenset() and any(runs[0])
 
 
+@pytest.mark.skipif(
+    importlib.util.find_spec("gymnasium_robotics") is None, reason="needs the extra 'kitchen'"
+)
 def test_an_operator_pushes_the_kettle_through_the_keys():
     env = make_env("franka_kitchen", "mujoco")
     env.task.horizon = 150

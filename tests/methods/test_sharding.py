@@ -1,5 +1,6 @@
 """Populations on eight devices, and on two processes, against the same on one device."""
 
+import json
 import os
 import socket
 import subprocess
@@ -35,6 +36,12 @@ def _finish(*processes):
     finally:
         for process in processes:
             process.kill()
+
+
+def _free_address():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{free.getsockname()[1]}"
 
 
 def _assert_same(folder, other, name):
@@ -76,12 +83,43 @@ def test_simulated_members_and_their_shared_counters_are_spread(one_device, eigh
 
 
 def test_two_processes_share_the_members_or_each_have_all(one_device, tmp_path):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
+    address = _free_address()
     outs = [tmp_path / "0", tmp_path / "1"]
     _finish(*(_start(out, *SIZES, "--", address, "2", str(i)) for i, out in enumerate(outs)))
     for out in outs:
         for name, num_devices in zip(SIZES, (2, 1), strict=True):
             devices, _ = _assert_same(out, one_device, name)
             assert set(devices) == {num_devices}
+
+
+def _launch(out, *flags):
+    command = [sys.executable, "-m", "experiments.represent", "--method=bc", "--preset=smoke"]
+    return subprocess.Popen(
+        [*command, "--env=inverted_double_pendulum", f"--out={out}", *flags],
+        cwd=ROOT,
+        env=os.environ
+        | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_backend_optimization_level=0"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def test_of_two_processes_of_a_run_the_first_writes(tmp_path):
+    address = f"--coordinator={_free_address()}"
+    flags = ("--distributed", "--num_processes=2", address)
+    _finish(*(_launch(tmp_path / "two", *flags, f"--process={i}") for i in range(2)))
+    _finish(_launch(tmp_path / "one"))
+    logs = []
+    for name in ("one", "two"):
+        lines = (tmp_path / name / "metrics.jsonl").read_text().splitlines()
+        told = [json.loads(line) for line in lines]
+        logs.append([line | {"time": 0} for line in told if line["stage"] != "clock"])
+    assert logs[0] == logs[1]
+    results = [
+        json.loads((tmp_path / name / "results.json").read_text()) for name in ("one", "two")
+    ]
+    measured = ("seconds", "peak_memory_gib")
+    for key in set(results[0]) - set(measured):
+        assert results[0][key] == results[1][key], key
+    assert (tmp_path / "two" / "report.html").exists()

@@ -9,7 +9,8 @@ from represent_jax.physics.engine import PhysicsState
 # Metres and radians per second of a held key, and by how much shift slows it down.
 LINEAR_SPEED, ANGULAR_SPEED, SLOW = 0.15, 0.6, 0.25
 
-# What a key moves: axes of the world (forward is away from the robot), then those of the hand.
+# What a key does, which entry of the hand's velocity (linear, then angular) it sets, and its sign.
+# Axes are those of the kitchen: x to the right, y away from the robot, z up.
 _MOVES = {
     "w": ("move forward", 1, 1.0),
     "s": ("move back", 1, -1.0),
@@ -31,6 +32,7 @@ _TURN_WEIGHT, _DAMPING = 0.15, 0.02
 _TURN_BACK, _TO_MIDDLE, _MIDDLE_WEIGHT = 2.0, 0.3, 0.01
 # A joint this near to its limit, in rad, moves no nearer.
 _MARGIN = 0.02
+# Seconds of an environment step.
 _STEP = 0.08
 
 
