@@ -11,6 +11,7 @@ from experiments import launch
 from represent_jax.api import load_config, load_policy
 from represent_jax.envs import Environment, make_env
 from represent_jax.errors import UsageError
+from represent_jax.physics import offscreen
 from represent_jax.report import video
 
 _RUN = flags.DEFINE_string("run", None, "Run folder.", required=True)
@@ -18,7 +19,9 @@ _TARGET = flags.DEFINE_string("target", "task", "Whose policy: task, strategy_1,
 _OUT = flags.DEFINE_string("out", "policy.mp4", "Video to write.")
 _STEPS = flags.DEFINE_integer("steps", 300, "Environment steps to show.", lower_bound=1)
 _SEED = flags.DEFINE_integer("seed", 0, "Seed of the initial state.")
-_CAMERA = flags.DEFINE_string("camera", None, "Name of the camera; the model's first if not given.")
+_CAMERA = flags.DEFINE_string(
+    "camera", None, "Name of the camera; one that follows the robot if there is."
+)
 
 
 def main(argv: list[str]) -> None:
@@ -38,7 +41,7 @@ def main(argv: list[str]) -> None:
 
     qpos, rewards = play(jax.random.PRNGKey(_SEED.value))
     model = env.engine.model
-    camera = _CAMERA.value or (0 if model.ncam else -1)
+    camera = _CAMERA.value or offscreen.default_camera(model)
     path = video.render(model, np.asarray(qpos), _OUT.value, 1.0 / env.engine.dt, camera)
     print(f"{path}: {_STEPS.value} steps, true return {float(rewards.sum()):.1f}")
 
