@@ -2,7 +2,7 @@
 SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-extras lint format lock bench clean
+.PHONY: help demo test test-extras docs lint format lock bench clean
 
 PYTHON ?= python3.12 python3.13 python3.11 python3
 VENV ?= .venv
@@ -40,6 +40,10 @@ test: lint ## ruff, then the whole test suite
 test-extras: $(VENV)/.installed-extras ## tests that need optional libraries: Ray, Stable-Baselines3
 	@$(RUN) pytest -m extras
 
+docs: $(VENV)/.installed-docs ## the documentation's site, in site/
+	@NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --quiet --strict
+	@echo "Documentation: site/index.html (open it in a browser)"
+
 lint: $(VENV)/.installed-dev ## ruff check and format check
 	@$(RUN) ruff check .
 	@$(RUN) ruff format --check .
@@ -56,7 +60,7 @@ lock: ## write constraints.txt anew with uv, keeping pins; LOCK=--upgrade moves 
 		$(LOCK) --output-file constraints.txt pyproject.toml
 
 clean: ## remove the environment and caches (runs/ stays)
-	rm -rf $(VENV) .pytest_cache .ruff_cache build dist
+	rm -rf $(VENV) .pytest_cache .ruff_cache build dist site
 	find represent_jax experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/.created:
@@ -82,3 +86,8 @@ $(VENV)/.installed-extras: EXTRAS := [$(TESTED),ray,sb3]
 $(VENV)/.installed-extras: $(VENV)/.created pyproject.toml constraints.txt
 	$(install)
 	@touch $@ $(VENV)/.installed $(VENV)/.installed-dev
+
+$(VENV)/.installed-docs: EXTRAS := [docs]
+$(VENV)/.installed-docs: $(VENV)/.created pyproject.toml constraints.txt
+	$(install)
+	@touch $@ $(VENV)/.installed

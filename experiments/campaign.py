@@ -10,15 +10,17 @@ them, found again by the hash of what they depend on.
 
 import contextlib
 import time
+from pathlib import Path
 
 from absl import flags
 
 from experiments import launch
 from represent_jax.campaign.entries import Entry, entries, record
 from represent_jax.campaign.variants import DOMAINS, TABLES
-from represent_jax.errors import RepresentError, unknown
+from represent_jax.errors import RepresentError, UsageError, unknown
 from represent_jax.report.values import format_duration
 from represent_jax.runs.graph import BLOCKED, FAILED, Engine, Graph, InTurn, Node
+from represent_jax.runs.tracking import WandbTracker
 
 _ENGINES = ("local", "ray")
 
@@ -31,6 +33,9 @@ _PRESET = flags.DEFINE_string("preset", "paper", "Settings to begin with: smoke,
 _OUT = flags.DEFINE_string("out", "runs/campaign", "Folder of the campaign.")
 _RECORD = flags.DEFINE_string("record", None, "File of records; <out>/records.jsonl if not given.")
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting of every run that has it.")
+_WANDB = flags.DEFINE_string(
+    "wandb", None, "Project of Weights & Biases to log to (extra `wandb`)."
+)
 _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Show what is done and left, and run nothing.")
 _ENGINE = flags.DEFINE_string("engine", "local", "Where stages run: local, in turn, or ray.")
 _ADDRESS = flags.DEFINE_string("address", "local", "Of Ray: local starts one here, auto, or host.")
@@ -44,11 +49,14 @@ def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     if _ENGINE.value not in _ENGINES:
         raise unknown("engine", _ENGINE.value, _ENGINES)
+    if _WANDB.value and _ENGINE.value != "local":
+        raise UsageError("--wandb: expected --engine=local, Ray's workers log to their files alone")
     seeds = range(_SEED.value, _SEED.value + _SEEDS.value)
     every = entries(
         _TABLES.value, _DOMAINS.value, seeds, _PRESET.value, _OVERRIDE.value, _VARIANTS.value
     )
-    graph = Graph((node for entry in every for node in entry.reports.values()), _OUT.value)
+    wanted = (node for entry in every for node in entry.reports.values())
+    graph = Graph(wanted, _OUT.value, _track if _WANDB.value else None)
     records = _RECORD.value or f"{_OUT.value}/records.jsonl"
     print(f"{len(every)} runs, {len(graph.nodes)} stages, {len(graph.left)} of them left")
     if _DRY_RUN.value:
@@ -91,6 +99,10 @@ def _engine(every: list[Entry]) -> contextlib.AbstractContextManager[Engine]:
 
     config = RayConfig(_ADDRESS.value, _SHARED.value, _RETRIES.value, _CPUS.value, _GPUS.value)
     return RayEngine(every, config)
+
+
+def _track(node: Node, folder: Path) -> WandbTracker:
+    return WandbTracker(_WANDB.value, folder, node.name, node.settings, group=_OUT.value)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,9 @@ Elsewhere each process is told where the first one listens, how many there are a
 """
 
 import sys
+import webbrowser
 from collections.abc import Callable
+from pathlib import Path
 
 from absl import app, flags, logging
 
@@ -42,6 +44,12 @@ def _guarded(main: Callable[[list[str]], None], argv: list[str]) -> None:
             raise
         print(f"error: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
+
+
+def open_page(page: Path) -> None:
+    """Shows a page in a browser, or says that there is none."""
+    if not webbrowser.open(page.resolve().as_uri()):
+        print(f"no browser here; open {page} in one")
 
 
 def refuse_arguments(argv: list[str]) -> None:

@@ -4,7 +4,6 @@ python -m experiments.play --run=runs/demo --target=task --out=task.mp4
 """
 
 import jax
-import numpy as np
 from absl import flags
 
 from experiments import launch
@@ -12,7 +11,7 @@ from represent_jax.api import load_config, load_policy
 from represent_jax.envs import Environment, make_env
 from represent_jax.errors import UsageError
 from represent_jax.physics import offscreen
-from represent_jax.report import video
+from represent_jax.report import showcase, video
 
 _RUN = flags.DEFINE_string("run", None, "Run folder.", required=True)
 _TARGET = flags.DEFINE_string("target", "task", "Whose policy: task, strategy_1, ...")
@@ -31,19 +30,12 @@ def main(argv: list[str]) -> None:
     if not isinstance(env, Environment):
         raise UsageError(f"{env.name}: only tasks on the engines of this package can be shown")
 
-    @jax.jit
-    def play(key):
-        def body(state, _):
-            state = env.step(state, policy(state.obs))
-            return state, (state.pipeline_state.qpos, state.reward)
-
-        return jax.lax.scan(body, env.reset(key), None, length=_STEPS.value)[1]
-
-    qpos, rewards = play(jax.random.PRNGKey(_SEED.value))
+    video.check_available()
+    qpos, rewards = showcase.motion(env, policy, jax.random.PRNGKey(_SEED.value), _STEPS.value)
     model = env.engine.model
     camera = _CAMERA.value or offscreen.default_camera(model)
-    path = video.render(model, np.asarray(qpos), _OUT.value, 1.0 / env.engine.dt, camera)
-    print(f"{path}: {_STEPS.value} steps, true return {float(rewards.sum()):.1f}")
+    path = video.render(model, qpos, _OUT.value, 1.0 / env.engine.dt, camera)
+    print(f"{path}: {len(rewards)} steps, true return {float(rewards.sum()):.1f}")
 
 
 if __name__ == "__main__":

@@ -16,12 +16,13 @@ from represent_jax import config as configs
 from represent_jax.data.catalogue import load_demonstrations, load_test
 from represent_jax.envs import make_env
 from represent_jax.methods.config import MethodConfig, make_problem
-from represent_jax.methods.plan import execute
+from represent_jax.methods.plan import execute, stage_names
 from represent_jax.methods.presets import make_config
 from represent_jax.methods.registry import METHODS, find_method
-from represent_jax.report import html, tables
+from represent_jax.report import html, showcase, tables
 from represent_jax.runs import open_run, processes
 from represent_jax.runs.records import append_results
+from represent_jax.runs.tracking import WandbTracker
 
 _ENV = flags.DEFINE_string("env", "half_cheetah", "Environment.")
 _METHOD = flags.DEFINE_string("method", "represent", f"One of {', '.join(METHODS)}.")
@@ -48,6 +49,12 @@ _CHECKPOINT_SECONDS = flags.DEFINE_float(
     "checkpoint_seconds", 60.0, "Least time between two checkpoints of a stage."
 )
 _RECORD = flags.DEFINE_string("record", None, "File to append the results to, one JSON a line.")
+_VIDEOS = flags.DEFINE_bool("videos", False, "Put videos on the report (extra `video`).")
+_OPEN = flags.DEFINE_bool("open", False, "Show the report in a browser.")
+_WANDB = flags.DEFINE_string(
+    "wandb", None, "Project of Weights & Biases to log to (extra `wandb`)."
+)
+_DRY_RUN = flags.DEFINE_bool("dry_run", False, "Show settings and stages, and run nothing.")
 
 
 def main(argv: list[str]) -> None:
@@ -78,17 +85,36 @@ def _run(config: MethodConfig, out: str) -> None:
     print(json.dumps(configs.to_dict(config), indent=2))
     if problem.demonstrations.num_strategies == 1 and config.method == "represent":
         print("one strategy alone: the rewards are learned, but nothing is decomposed")
-    with open_run(out, config, resume=_RESUME.value) as run:
-        stages = find_method(config.method).plan(config, problem, _CHECKPOINT_SECONDS.value)
+    method = find_method(config.method)
+    stages = method.plan(config, problem, _CHECKPOINT_SECONDS.value)
+    names = stage_names(stages, _UNTIL.value)
+    if _DRY_RUN.value:
+        print(f"{out}: {' -> '.join(names)}")
+        return
+    tracker = None
+    if _WANDB.value:
+        tracker = WandbTracker(_WANDB.value, out, out, configs.to_dict(config))
+    with open_run(out, config, _RESUME.value, tracker) as run:
         results = execute(config, problem, stages, run, _UNTIL.value)
         if results is None:
             print(f"{out}: done until {_UNTIL.value}; --resume goes on")
             return
         if not processes.is_first():
             return
+        if _VIDEOS.value:
+            showcase.make(
+                run,
+                env,
+                problem.env.horizon,
+                problem.demonstrations,
+                config.group_names,
+                lambda: method.load_policies(config, env, run),
+            )
         page = html.write_report(run.path)
     print(tables.summary(results))
     print(f"report: {page}")
+    if _OPEN.value:
+        launch.open_page(page)
     if _RECORD.value:
         append_results(_RECORD.value, config.method, configs.config_hash(config), results)
 

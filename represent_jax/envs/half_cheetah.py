@@ -3,8 +3,9 @@
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
-from represent_jax.envs.task import Task, load_gymnasium_model
+from represent_jax.envs.task import Task, load_gymnasium_model, qpos_along_track
 from represent_jax.physics.engine import PhysicsState
 from represent_jax.physics.mjx import MjxSolver
 
@@ -32,3 +33,7 @@ class HalfCheetah(Task):
     ) -> jax.Array:
         forward_velocity = (after.qpos[0] - before.qpos[0]) / dt
         return forward_velocity - 0.1 * jnp.sum(jnp.square(action_t))
+
+    def qpos_of(self, model: mujoco.MjModel, obs: np.ndarray, dt: float) -> np.ndarray:
+        del model
+        return qpos_along_track(obs, dt)

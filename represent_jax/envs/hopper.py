@@ -3,8 +3,9 @@
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
-from represent_jax.envs.task import Task, load_gymnasium_model
+from represent_jax.envs.task import Task, load_gymnasium_model, qpos_along_track
 from represent_jax.physics.engine import PhysicsState
 from represent_jax.physics.mjx import MjxSolver
 
@@ -42,6 +43,10 @@ class Hopper(Task):
 
     def terminated(self, physics: PhysicsState) -> jax.Array:
         return ~_is_healthy(physics)
+
+    def qpos_of(self, model: mujoco.MjModel, obs: np.ndarray, dt: float) -> np.ndarray:
+        del model
+        return qpos_along_track(obs, dt)
 
 
 def _is_healthy(physics: PhysicsState) -> jax.Array:

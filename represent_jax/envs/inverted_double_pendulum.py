@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from represent_jax.envs.keyboard import DirectKeyboard
 from represent_jax.envs.task import Task, load_gymnasium_model
@@ -60,6 +61,10 @@ class InvertedDoublePendulum(Task):
     def readings(self, physics: PhysicsState) -> dict[str, jax.Array]:
         _, tip_height = _tip(physics)
         return {"height of the tip, m": tip_height}
+
+    def qpos_of(self, model: mujoco.MjModel, obs: np.ndarray, dt: float) -> np.ndarray:
+        del model, dt
+        return np.column_stack([obs[:, 0], np.arctan2(obs[:, 1:3], obs[:, 3:5])])
 
     def keyboard(self, model: mujoco.MjModel) -> DirectKeyboard:
         pushes = (

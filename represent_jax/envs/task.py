@@ -104,10 +104,41 @@ class Task(abc.ABC):
         del obs
         return {}
 
+    def qpos_of(self, model: mujoco.MjModel, obs: np.ndarray, dt: float) -> np.ndarray | None:
+        """Returns the positions behind an episode's observations; None where they do not tell.
+
+        Demonstrations hold observations alone; this is what lets a video show them.
+
+        Args:
+          model: the scene they are to be shown in.
+          obs: observations of successive steps, `[T, obs_dim]`.
+          dt: seconds between two of them.
+
+        Returns:
+          Positions `[T, nq]`; a place that observations leave out begins at 0.
+        """
+        del model, obs, dt
+        return None
+
     def keyboard(self, model: mujoco.MjModel) -> Keyboard | None:
         """Returns the keys that drive the robot; None where it can only be watched."""
         del model
         return None
+
+
+def qpos_along_track(obs: np.ndarray, dt: float) -> np.ndarray:
+    """Positions of a planar robot that observes qpos without its place x, then qvel.
+
+    x, which neither observation nor policy knows of, is integrated from its velocity.
+
+    Args:
+      obs: observations of successive steps, `[T, 2 nq - 1]`.
+      dt: seconds between two of them.
+    """
+    others = (obs.shape[1] - 1) // 2
+    velocity = obs[:, others]
+    moved = 0.5 * dt * (velocity[1:] + velocity[:-1])
+    return np.column_stack([np.concatenate([[0.0], np.cumsum(moved)]), obs[:, :others]])
 
 
 def load_gymnasium_model(file_name: str) -> mujoco.MjModel:

@@ -64,6 +64,18 @@ def run_stage(seed: int, stage: Stage, directory: RunDirectory, *inputs: Any) ->
     return directory.load_findings(stage.name)
 
 
+def stage_names(stages: Sequence[Stage], until: str = "") -> list[str]:
+    """Names of a plan's stages as far as the one named `until`, of all if empty.
+
+    Raises:
+      UsageError: no stage of that name.
+    """
+    names = [stage.name for stage in stages]
+    if until and until not in names:
+        raise unknown("stage", until, names)
+    return names[: names.index(until) + 1] if until else names
+
+
 def execute(
     config: MethodConfig,
     problem: Problem,
@@ -87,15 +99,13 @@ def execute(
       UsageError: no stage of that name.
       RepresentError: a loss diverged, or Phase 1's reward is not finite.
     """
-    names = [stage.name for stage in stages]
-    if until and until not in names:
-        raise unknown("stage", until, names)
+    stage_names(stages, until)
     clock, outputs = Clock(directory), {}
     for stage in stages:
         with clock(stage.name):
             inputs = (outputs[before] for before in stage.inputs)
             outputs[stage.name] = run_stage(config.seed, stage, directory, *inputs)
-        if stage.name == until != names[-1]:
+        if stage.name == until != stages[-1].name:
             return None
     results = describe(config, problem)
     for stage in stages:

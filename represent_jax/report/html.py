@@ -1,6 +1,8 @@
-"""The page of a run: one file that needs no network, made from whatever stages are done."""
+"""The page of a run, made from whatever stages are done.
 
-import html
+One file that needs no network; only videos, where there are any, lie beside it.
+"""
+
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -10,11 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from represent_jax.data.atomic import replacing
-from represent_jax.errors import RepresentError
-from represent_jax.report import diagnostics, figures, tables
-from represent_jax.report.page import STYLE
+from represent_jax.report import contents, diagnostics, figures, showcase, tables
+from represent_jax.report.page import document, flat, gallery, pairs, table, text
 from represent_jax.report.values import display_name, format_number
-from represent_jax.runs.directory import RunDirectory, load_config_json
 from represent_jax.runs.records import provenance
 
 _STAGES = {
@@ -52,14 +52,7 @@ def write_report(run_path: str | os.PathLike) -> Path:
     Raises:
         RepresentError: the folder holds no run, or its results cannot be read or written to.
     """
-    run = RunDirectory(run_path)
-    config = load_config_json(run.path)
-    results = run.read_results() if (run.path / "results.json").exists() else {}
-    if not isinstance(results, dict):
-        raise RepresentError(f"{run.path / 'results.json'}: not the results of a run")
-    curves = dict(zip(tables.groups(results), results.get("curve") or (), strict=False))
-    points = _scatter_points(_arrays(run, "scatter"))
-    learning = _learning_curves(_arrays(run, "learning_curves"))
+    run, config, results, curves, points, learning = contents.load(run_path)
     levels = tables.demonstrator_levels(results)
 
     drawn = {
@@ -73,7 +66,8 @@ def write_report(run_path: str | os.PathLike) -> Path:
 
     page = run.path / "report.html"
     with replacing(page) as temporary:
-        temporary.write_text(_page(config, results, learning, drawn), encoding="utf-8")
+        page_html = _page(config, results, learning, drawn, showcase.read(run))
+        temporary.write_text(page_html, encoding="utf-8")
     return page
 
 
@@ -82,28 +76,24 @@ def _page(
     results: Mapping[str, Any],
     learning: Mapping[str, Mapping[str, np.ndarray]],
     drawn: Mapping[str, Mapping[str, Figure]],
+    shown: showcase.Showcase | None,
 ) -> str:
     env = results.get("env", config.get("env", "unknown environment"))
     body = [
         _header(env, config, results),
         _notices(results),
         _verdicts(diagnostics.verdicts(results, learning)),
-        _table(tables.returns_table(results)),
-        _gallery("Policies", drawn["learning"], _LEARNING_NOTE, "Learning curves"),
-        _table(tables.rewards_table(results)),
-        _gallery("Rewards", drawn["scatter"], _SCATTER_NOTE, "Learned against true return"),
-        _gallery("Noise and performance", drawn["curve"], _CURVES_NOTE, "Noise-performance curve"),
+        table(tables.returns_table(results)),
+        gallery("Policies", drawn["learning"], _LEARNING_NOTE, "Learning curves"),
+        _videos(shown),
+        table(tables.rewards_table(results)),
+        gallery("Rewards", drawn["scatter"], _SCATTER_NOTE, "Learned against true return"),
+        gallery("Noise and performance", drawn["curve"], _CURVES_NOTE, "Noise-performance curve"),
         _times(results.get("seconds") or {}),
-        _pairs("Configuration", _flat(config)),
-        _pairs("Versions", _versions(results)),
+        pairs("Configuration", flat(config)),
+        pairs("Versions", _versions(results)),
     ]
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>REPRESENT: {_text(env)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(part for part in body if part)
-        + "\n</main>\n</body>\n</html>\n"
-    )
+    return document(f"REPRESENT: {env}", body)
 
 
 def _header(env: Any, config: Mapping[str, Any], results: Mapping[str, Any]) -> str:
@@ -114,13 +104,13 @@ def _header(env: Any, config: Mapping[str, Any], results: Mapping[str, Any]) -> 
     memory = results.get("peak_memory_gib")
     facts.append(("peak memory", None if memory is None else f"{format_number(memory, 1)} GiB"))
     shown = "".join(
-        f"<li><span>{_text(key)}</span> {_text(value)}</li>"
+        f"<li><span>{text(key)}</span> {text(value)}</li>"
         for key, value in facts
         if value is not None
     )
     return (
         "<header><p>REPRESENT: reward decomposition from suboptimal, heterogeneous "
-        f"demonstrations</p><h1>{_text(display_name(str(env)))}</h1>"
+        f"demonstrations</p><h1>{text(display_name(str(env)))}</h1>"
         f"<ul class=facts>{shown}</ul></header>"
     )
 
@@ -139,16 +129,16 @@ def _notices(results: Mapping[str, Any]) -> str:
             "and strategy reward may share what was learned in any way."
         )
     notices += tables.missing(results)
-    return "".join(f"<p class=notice>{_text(notice)}</p>" for notice in notices)
+    return "".join(f"<p class=notice>{text(notice)}</p>" for notice in notices)
 
 
 def _verdicts(verdicts: Iterable[diagnostics.Verdict]) -> str:
     cards = []
     for verdict in verdicts:
-        details = "".join(f"<li>{_text(line)}</li>" for line in verdict.details)
+        details = "".join(f"<li>{text(line)}</li>" for line in verdict.details)
         cards.append(
-            f'<article class="card {verdict.level}"><h3>{_text(verdict.question)}'
-            f"<b>{_text(verdict.level)}</b></h3><p>{_text(verdict.sentence)}</p>"
+            f'<article class="card {verdict.level}"><h3>{text(verdict.question)}'
+            f"<b>{text(verdict.level)}</b></h3><p>{text(verdict.sentence)}</p>"
             f"<ul>{details}</ul></article>"
         )
     if not cards:
@@ -156,35 +146,23 @@ def _verdicts(verdicts: Iterable[diagnostics.Verdict]) -> str:
     return f"<section><h2>Verdicts</h2><div class=cards>{''.join(cards)}</div></section>"
 
 
-def _table(table: tables.Table | None) -> str:
-    if table is None:
+def _videos(shown: showcase.Showcase | None) -> str:
+    if shown is None:
         return ""
-    head = "".join(f"<th scope=col>{_text(cell)}</th>" for cell in table.columns)
-    rows = "".join(
-        f"<tr><th scope=row>{_text(row[0])}</th>"
-        + "".join(f"<td>{_typeset(cell)}</td>" for cell in row[1:])
-        + "</tr>"
-        for row in table.rows
-    )
-    return (
-        f"<section><h2>{_text(table.title)}</h2><div class=scroll><table><thead><tr>{head}</tr>"
-        f"</thead><tbody>{rows}</tbody></table></div>"
-        f"<p class=note>{_text(table.note)}</p></section>"
-    )
-
-
-def _gallery(title: str, drawn: Mapping[str, Figure], note: str, what: str) -> str:
-    if not drawn:
-        return ""
-    images = "".join(
-        f'<img src="{figures.svg_data_uri(figure)}" '
-        f'alt="{_text(what)}: {_text(display_name(target))}">'
-        for target, figure in drawn.items()
-    )
-    return (
-        f"<section><h2>{_text(title)}</h2><div class=gallery>{images}</div>"
-        f"<p class=note><b>How to read this.</b> {_text(note)}</p></section>"
-    )
+    parts = []
+    for video in shown.videos:
+        panels = "".join(
+            f"<span><b>{text(panel.name)}</b>, "
+            f"true return {format_number(panel.true_return)}</span>"
+            for panel in video.panels
+        )
+        parts.append(
+            f"<figure><h3>{text(display_name(video.target))}</h3>"
+            f'<video src="{text(video.file)}" controls loop muted playsinline></video>'
+            f"<figcaption>{panels}</figcaption></figure>"
+        )
+    parts += [f"<p class=notice>{text(line)}</p>" for line in shown.notices]
+    return f"<section><h2>Side by side</h2>{''.join(parts)}</section>"
 
 
 def _times(seconds: Mapping[str, float | None]) -> str:
@@ -193,79 +171,17 @@ def _times(seconds: Mapping[str, float | None]) -> str:
         return ""
     longest = max(*known.values(), 1e-9)
     rows = "".join(
-        f"<tr><th scope=row>{_text(stage)}</th><td>{_duration(value)}</td>"
+        f"<tr><th scope=row>{text(stage)}</th><td>{_duration(value)}</td>"
         f'<td class=bar><i style="width:{100 * value / longest:.1f}%"></i></td></tr>'
         for stage, value in known.items()
     )
     return f"<section><h2>Time</h2><table class=times><tbody>{rows}</tbody></table></section>"
 
 
-def _pairs(title: str, pairs: Mapping[str, Any]) -> str:
-    rows = "".join(
-        f"<tr><th scope=row>{_text(key)}</th><td>{_text(value)}</td></tr>"
-        for key, value in pairs.items()
-    )
-    return (
-        f"<details><summary>{_text(title)}</summary>"
-        f"<div class=scroll><table class=pairs><tbody>{rows}</tbody></table></div></details>"
-    )
-
-
 def _versions(results: Mapping[str, Any]) -> dict[str, Any]:
     """Returns what the run noted of its code and machine, or else what this process runs on."""
     found = {**provenance(), **{k: results[k] for k in provenance() if results.get(k)}}
-    return _flat(found)
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Returns nested dictionaries as one, with dotted keys."""
-    pairs = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            pairs |= _flat(value, f"{prefix}{key}.")
-        else:
-            pairs[prefix + key] = value
-    return pairs
-
-
-def _arrays(run: RunDirectory, name: str) -> dict[str, np.ndarray]:
-    if not (run.path / "arrays" / f"{name}.npz").exists():
-        return {}
-    return run.load_arrays(name)
-
-
-def _scatter_points(
-    arrays: Mapping[str, np.ndarray],
-) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    points: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
-    for key, true in arrays.items():
-        target, group, which = _split(key, 3)
-        learned = arrays.get(f"{target}/{group}/learned")
-        if which == "true" and learned is not None and len(true):
-            points.setdefault(target, {})[group] = (true, learned)
-    return _in_order(points)
-
-
-def _learning_curves(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
-    curves: dict[str, dict[str, np.ndarray]] = {}
-    for key, values in arrays.items():
-        target, name = _split(key, 2)
-        curves.setdefault(target, {})[name] = values
-    needed = {"env_steps", "true_return", "learned_return"}
-    return _in_order({t: c for t, c in curves.items() if needed <= c.keys()})
-
-
-def _split(key: str, num: int) -> tuple[str, ...]:
-    parts = key.split("/")
-    if len(parts) != num:
-        raise RepresentError(f"array {key!r}: expected a name of {num} parts, found {len(parts)}")
-    return tuple(parts)
-
-
-def _in_order(by_target: dict[str, Any]) -> dict[str, Any]:
-    """Returns the task first, then the strategies by number."""
-    order = sorted(by_target, key=lambda t: (t != "task", len(t), t))
-    return {target: by_target[target] for target in order}
+    return flat(found)
 
 
 def _duration(seconds: float) -> str:
@@ -274,19 +190,3 @@ def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"
-
-
-def _text(value: Any) -> str:
-    return html.escape(str(value))
-
-
-def _typeset(cell: str) -> str:
-    """Returns a cell of the plain-text table with the signs that a page can show."""
-    cell = cell.replace("+-", "\N{PLUS-MINUS SIGN}")
-    if cell == "-":
-        return "\N{EN DASH}"
-    if cell.startswith("-"):
-        cell = "\N{MINUS SIGN}" + cell[1:]
-    if cell.endswith("x"):
-        cell = cell[:-1] + "\N{MULTIPLICATION SIGN}"
-    return _text(cell)

@@ -1,4 +1,14 @@
-"""The style sheet of the report's page."""
+"""What the pages are made of: a document with its style, tables, galleries of figures."""
+
+import html
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from represent_jax.report import figures
+from represent_jax.report.tables import Table
+from represent_jax.report.values import display_name
 
 STYLE = """
 :root { color-scheme: light; --ink: #1f2933; --muted: #5d6975; --line: #e3e7eb;
@@ -15,6 +25,8 @@ h2 { margin: 0 0 .8rem; font-size: 1.2rem; }
 .facts li { background: #fff; border: 1px solid var(--line); border-radius: 999px;
   padding: .12rem .75rem; font-size: .9rem; }
 .facts span { color: var(--muted); }
+.facts i { display: inline-block; width: 1.6em; height: .35em; border-radius: 2px;
+  margin-right: .5em; vertical-align: middle; }
 section, details { background: #fff; border: 1px solid var(--line); border-radius: 12px;
   padding: 1.2rem 1.2rem 1.1rem; margin-top: 1.1rem; }
 .notice { background: #fff8e1; border: 1px solid #f0dca0; border-radius: 12px;
@@ -46,6 +58,11 @@ tbody tr:last-child > * { border-bottom: 0; }
 .gallery { display: grid; gap: 1rem;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 310px), 1fr)); }
 .gallery img { width: 100%; max-width: 460px; height: auto; display: block; margin: 0 auto; }
+figure { margin: 0 0 1rem; }
+figure video { width: 100%; display: block; border-radius: 8px; background: #000; }
+figcaption { display: flex; margin-top: .35rem; font-size: .9rem; }
+figcaption span { flex: 1; text-align: center; color: var(--muted); }
+figcaption b { color: var(--ink); }
 .times td:nth-child(2) { width: 1%; }
 .times th { width: 1%; }
 .times .bar { padding-right: 0; }
@@ -57,3 +74,87 @@ details .scroll { margin-top: .8rem; }
   overflow-wrap: anywhere; }
 .pairs th { color: var(--muted); width: 45%; }
 """
+
+
+def document(title: str, body: Iterable[str]) -> str:
+    """Returns a page of its own from its sections; empty ones are left out."""
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{text(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
+        + "\n".join(part for part in body if part)
+        + "\n</main>\n</body>\n</html>\n"
+    )
+
+
+def table(shown: Table | None) -> str:
+    """Returns a table as a section, and nothing for none."""
+    if shown is None:
+        return ""
+    head = "".join(f"<th scope=col>{text(cell)}</th>" for cell in shown.columns)
+    rows = "".join(
+        f"<tr><th scope=row>{text(row[0])}</th>"
+        + "".join(f"<td>{typeset(cell)}</td>" for cell in row[1:])
+        + "</tr>"
+        for row in shown.rows
+    )
+    return (
+        f"<section><h2>{text(shown.title)}</h2><div class=scroll><table><thead><tr>{head}</tr>"
+        f"</thead><tbody>{rows}</tbody></table></div>"
+        f"<p class=note>{text(shown.note)}</p></section>"
+    )
+
+
+def gallery(title: str, drawn: Mapping[str, Figure], note: str, what: str) -> str:
+    """Returns figures side by side as a section; `what` they are is for those who cannot see."""
+    if not drawn:
+        return ""
+    images = "".join(
+        f'<img src="{figures.svg_data_uri(figure)}" '
+        f'alt="{text(what)}: {text(display_name(target))}">'
+        for target, figure in drawn.items()
+    )
+    return (
+        f"<section><h2>{text(title)}</h2><div class=gallery>{images}</div>"
+        f"<p class=note><b>How to read this.</b> {text(note)}</p></section>"
+    )
+
+
+def pairs(title: str, values: Mapping[str, Any]) -> str:
+    """Returns names and values, folded away under a title."""
+    rows = "".join(
+        f"<tr><th scope=row>{text(key)}</th><td>{text(value)}</td></tr>"
+        for key, value in values.items()
+    )
+    return (
+        f"<details><summary>{text(title)}</summary>"
+        f"<div class=scroll><table class=pairs><tbody>{rows}</tbody></table></div></details>"
+    )
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Returns nested dictionaries as one, with dotted keys."""
+    found = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            found |= flat(value, f"{prefix}{key}.")
+        else:
+            found[prefix + key] = value
+    return found
+
+
+def text(value: Any) -> str:
+    """Returns a value as text that no page takes for HTML."""
+    return html.escape(str(value))
+
+
+def typeset(cell: str) -> str:
+    """Returns a cell of the plain-text table with the signs that a page can show."""
+    cell = cell.replace("+-", "\N{PLUS-MINUS SIGN}")
+    if cell == "-":
+        return "\N{EN DASH}"
+    if cell.startswith("-"):
+        cell = "\N{MINUS SIGN}" + cell[1:]
+    if cell.endswith("x"):
+        cell = cell[:-1] + "\N{MULTIPLICATION SIGN}"
+    return text(cell)

@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import mujoco
@@ -39,22 +39,65 @@ def render(
             file cannot be written.
         UsageError: the model has no such camera.
     """
+    return render_beside(model, [qpos], path, fps, camera, size)
+
+
+def render_beside(
+    model: mujoco.MjModel,
+    motions: Sequence[np.ndarray],
+    path: str | os.PathLike,
+    fps: float,
+    camera: str | int = -1,
+    size: tuple[int, int] = (640, 480),
+) -> Path:
+    """Renders motions of one model side by side; those that end before the longest stand still.
+
+    Args:
+        model: the model.
+        motions: positions [T, nq] of each motion, from left to right.
+        path: the file; missing folders are made.
+        fps: frames a second.
+        camera: name or index of one of the model's cameras, -1 for the free camera.
+        size: width and height of a panel in pixels, even numbers.
+
+    Raises:
+        RepresentError, UsageError: as `render`.
+    """
+    motions = [_checked(model, qpos) for qpos in motions]
+    view = offscreen.find_camera(model, camera)
+    ffmpeg = _ffmpeg()
+    path = Path(path)
+    width, height = size
+    with offscreen.renderer(model, size) as draw, replacing(path) as temporary:
+        with _encoder(ffmpeg, temporary, fps, (width * len(motions), height)) as send:
+            data = mujoco.MjData(model)
+            frame = np.empty((height, width * len(motions), 3), np.uint8)
+            for step in range(max(len(qpos) for qpos in motions)):
+                for panel, qpos in enumerate(motions):
+                    data.qpos[:] = qpos[min(step, len(qpos) - 1)]
+                    mujoco.mj_forward(model, data)
+                    frame[:, panel * width : (panel + 1) * width] = draw(data, view)
+                send(frame)
+    return path
+
+
+def check_available() -> None:
+    """Checks that videos can be made here, before anything is computed for them.
+
+    Raises:
+        RepresentError: ffmpeg or a GL library is missing.
+    """
+    _ffmpeg()
+    offscreen.gl_context(64, 64).free()
+
+
+def _checked(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     qpos = np.asarray(qpos, np.float64)
     if qpos.ndim != 2 or qpos.shape[1] != model.nq or not len(qpos):
         raise RepresentError(f"video: expected qpos [T, {model.nq}], found shape {qpos.shape}")
     if not np.all(np.isfinite(qpos)):
         raise RepresentError("video: qpos holds NaN or infinity")
-    view = offscreen.find_camera(model, camera)
-    ffmpeg = _ffmpeg()
-    path = Path(path)
-    with offscreen.renderer(model, size) as draw, replacing(path) as temporary:
-        with _encoder(ffmpeg, temporary, fps, size) as send:
-            data = mujoco.MjData(model)
-            for position in qpos:
-                data.qpos[:] = position
-                mujoco.mj_forward(model, data)
-                send(draw(data, view))
-    return path
+    return qpos
 
 
 def _ffmpeg() -> str:

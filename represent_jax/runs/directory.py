@@ -7,7 +7,7 @@ checkpoints/<stage>  `output` once the stage is done, `progress/<step>` until th
 arrays/<name>.npz    plot data
 findings/<stage>.json what a stage found
 results.json         what the run found
-figures/ report.html
+figures/ videos/ report.html
 
 Of several processes that run one program, the first writes and all read: see `runs.processes`.
 """
@@ -31,6 +31,7 @@ from represent_jax.data.npz import load_arrays
 from represent_jax.errors import RepresentError, UsageError
 from represent_jax.runs import checkpoint, processes
 from represent_jax.runs.tensorboard import ScalarLog
+from represent_jax.runs.tracking import Tracker
 
 FORMAT_VERSION = 1
 
@@ -46,9 +47,10 @@ class RunDirectory:
         path: the folder.
     """
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(self, path: str | os.PathLike, tracker: Tracker | None = None):
         """Refers to a folder, and touches nothing; `open_run` makes or checks one."""
         self.path = Path(path)
+        self._tracker = tracker
         self._scalar_logs: dict[str, ScalarLog] = {}
         self._purge_steps: dict[str, int] = {}
 
@@ -59,14 +61,21 @@ class RunDirectory:
         self.close()
 
     def close(self) -> None:
-        """Closes the TensorBoard logs."""
+        """Closes the logs."""
         for stage in list(self._scalar_logs):
             self._close_scalar_log(stage)
+        if self._tracker is not None:
+            self._tracker.close()
 
     @property
     def figures(self) -> Path:
         """Folder of the figures."""
         return self.path / "figures"
+
+    @property
+    def videos(self) -> Path:
+        """Folder of the videos."""
+        return self.path / "videos"
 
     def is_done(self, stage: str) -> bool:
         """Returns whether the stage's output is saved."""
@@ -134,6 +143,8 @@ class RunDirectory:
             with open(self.path / "metrics.jsonl", "a") as file:
                 file.write(line + "\n")
             self._scalar_log(stage).write(step, _scalars(values))
+        if self._tracker is not None:
+            self._tracker.write(stage, step, _scalars(values))
 
     def read_log(self, stage: str | None = None) -> list[dict[str, Any]]:
         """Returns the logged lines, oldest first, of one stage or of all of them."""
@@ -228,13 +239,16 @@ class RunDirectory:
                 self._scalar_logs.pop(stage).close()
 
 
-def open_run(path: str | os.PathLike, config: Any, resume: bool = False) -> RunDirectory:
+def open_run(
+    path: str | os.PathLike, config: Any, resume: bool = False, tracker: Tracker | None = None
+) -> RunDirectory:
     """Makes a run's folder, or opens one to go on with its run.
 
     Args:
         path: the folder.
         config: the run's configuration, a dataclass or a dictionary.
         resume: whether to go on with the run that the folder may hold.
+        tracker: takes what the run logs, beside its own files.
 
     Raises:
         UsageError: the folder is not empty and `resume` is not set, or what it holds is no run, a
@@ -252,7 +266,7 @@ def open_run(path: str | os.PathLike, config: Any, resume: bool = False) -> RunD
         _check_same_config(path, load_config_json(path), json.loads(json.dumps(values)))
     else:
         _write_json(path / "config.json", {"format_version": FORMAT_VERSION, "config": values})
-    return RunDirectory(path)
+    return RunDirectory(path, tracker)
 
 
 def load_config_json(path: str | os.PathLike) -> dict[str, Any]:

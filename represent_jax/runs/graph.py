@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from represent_jax.data.atomic import replacing
 from represent_jax.errors import RepresentError
 from represent_jax.runs.directory import RunDirectory, open_run
+from represent_jax.runs.tracking import Tracker
 
 DONE, FAILED, BLOCKED = "done", "failed", "blocked"
 MARK = "done.json"
@@ -78,9 +79,21 @@ class InTurn:
 class Graph:
     """Nodes and the folder their outputs live in."""
 
-    def __init__(self, nodes: Iterable[Node], folder: Path):
-        """Orders the nodes, with all they need, so that inputs come first."""
+    def __init__(
+        self,
+        nodes: Iterable[Node],
+        folder: Path,
+        track: Callable[[Node, Path], Tracker] | None = None,
+    ):
+        """Orders the nodes, with all they need, so that inputs come first.
+
+        Args:
+          nodes: the nodes that are wanted.
+          folder: where their folders are.
+          track: makes what takes a node's logs beside its own files, from node and folder.
+        """
         self.folder = Path(folder)
+        self._track = track
         self.nodes: list[Node] = []
         self.states: dict[str, str] = {}
         self.errors: dict[str, str] = {}
@@ -163,7 +176,10 @@ class Graph:
         """Runs one node here and marks it as done; returns what went wrong, or None."""
         start = time.monotonic()
         try:
-            self._outputs[node.hash] = node.run(self.directory(node), *self._inputs(node))
+            inputs = self._inputs(node)
+            tracker = self._track(node, self.folder / node.hash) if self._track else None
+            with self.directory(node, tracker) as directory:
+                self._outputs[node.hash] = node.run(directory, *inputs)
         except (RepresentError, ArithmeticError, ValueError, RuntimeError) as error:
             return f"{type(error).__name__}: {error}"
         seconds = round(time.monotonic() - start, 1)
@@ -179,11 +195,11 @@ class Graph:
             self._outputs[node.hash] = node.run(self.directory(node), *self._inputs(node))
         return self._outputs[node.hash]
 
-    def directory(self, node: Node) -> RunDirectory:
+    def directory(self, node: Node, tracker: Tracker | None = None) -> RunDirectory:
         """Returns the folder of a node, made where there is none."""
         config = {"kind": node.kind, "settings": dict(node.settings)}
         config["inputs"] = [before.hash for before in node.inputs]
-        return open_run(self.folder / node.hash, config, resume=True)
+        return open_run(self.folder / node.hash, config, resume=True, tracker=tracker)
 
     def _inputs(self, node: Node) -> Sequence[Any]:
         return [self.output(before) for before in node.inputs]

@@ -4,7 +4,7 @@ MSRD (Chen, Paleja, Ghuy, Gombolay, HRI 2020, https://arxiv.org/abs/2001.00503) 
 for each of M strategies, whose discriminators share a part of their reward:
 
   logits_i = f_i(s, s') - log pi_i(a|s),
-  f_i = [R^0 + alpha R~_i](s') + gamma h_i(s') - h_i(s).
+  f_i = (R^0 + alpha R~_i)(s') + gamma h_i(s') - h_i(s).
 
 Its code's loss of a strategy adds 0.01 sum R~_i^2 + 0.0001 sum R^0^2 to the cross-entropy, sums of
 squared outputs over a batch of 64 rows. Here they are means, of any number of rows, so that the

@@ -210,3 +210,28 @@ def test_taken_name_is_refused(reach):
     with pytest.raises(UsageError, match="'reach' is already registered"):
         register(Reach, "reach")
     assert "reach" in names()
+
+
+@pytest.mark.parametrize("name", ["hopper", "half_cheetah", "inverted_double_pendulum"])
+def test_observations_tell_positions(name):
+    env = make_env(name, "mujoco")
+
+    @jax.jit
+    def play(key):
+        def body(state, action):
+            state = env.step(state, action)
+            return state, (state.obs, state.pipeline_state.qpos)
+
+        actions = jax.random.uniform(key, (40, env.action_size), minval=-1.0, maxval=1.0)
+        return jax.lax.scan(body, env.reset(key), actions)[1]
+
+    obs, qpos = (np.asarray(x) for x in play(jax.random.PRNGKey(0)))
+    found = env.task.qpos_of(env.engine.model, obs, env.engine.dt)
+    assert found.shape == qpos.shape
+    if name == "inverted_double_pendulum":
+        np.testing.assert_allclose(np.sin(found), np.sin(qpos), atol=1e-5)
+    else:
+        np.testing.assert_allclose(found[:, 1:], qpos[:, 1:], atol=1e-5)
+        # The place along the track is integrated from its velocity.
+        travelled = np.abs(np.diff(qpos[:, 0])).sum()
+        assert np.abs(found[:, 0] - (qpos[:, 0] - qpos[0, 0])).max() < 0.15 * travelled

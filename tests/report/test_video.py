@@ -1,5 +1,6 @@
 """Off-screen videos, where there is a GL library, and the messages where there is none."""
 
+import contextlib
 import sys
 
 import mujoco
@@ -45,6 +46,16 @@ def test_a_video_has_one_frame_a_position(model, gl, tmp_path):
     assert frames == 12
     assert seconds == pytest.approx(0.5, abs=0.05)
     assert [file.name for file in path.parent.iterdir()] == ["ball.mp4"]
+
+
+def test_motions_stand_side_by_side_and_the_shorter_one_waits(model, gl, tmp_path):
+    import imageio_ffmpeg
+
+    motions = [np.zeros((3, 1)), np.linspace(-1.0, 1.0, 7)[:, None]]
+    path = video.render_beside(model, motions, tmp_path / "two.mp4", fps=24, size=(64, 48))
+    frames, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    with contextlib.closing(imageio_ffmpeg.read_frames(str(path))) as reader:
+        assert (frames, next(reader)["size"]) == (7, (128, 48))
 
 
 def test_the_drawing_follows_the_position(model, gl):

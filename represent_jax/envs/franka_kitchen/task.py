@@ -116,6 +116,13 @@ class FrankaKitchen(Task):
         del before, action_t, dt
         return -jnp.linalg.norm(after.qpos[-7:-4] - jnp.asarray(KETTLE_GOAL, jnp.float32))
 
+    def qpos_of(self, model: mujoco.MjModel, obs: np.ndarray, dt: float) -> np.ndarray:
+        del dt
+        others = obs[:, 2 * NUM_JOINTS : _KETTLE.stop]
+        if model.nq < NUM_JOINTS + others.shape[1]:
+            others = others[:, NUM_FIXTURES:]
+        return np.column_stack([obs[:, :NUM_JOINTS], others])
+
     def outcomes(self, obs: jax.Array) -> dict[str, jax.Array]:
         """Final distance of the kettle in m, and whether it stands within 5 cm of its goal."""
         kettle = obs[..., -1, _KETTLE]
