@@ -10,6 +10,7 @@ from experiments import launch
 from represent_jax.api import load_config, load_policy
 from represent_jax.envs import make_env
 from represent_jax.errors import UsageError
+from represent_jax.physics import offscreen
 from represent_jax.teleoperation.painter import Painter
 from represent_jax.teleoperation.session import Session
 
@@ -23,7 +24,9 @@ _HORIZON = flags.DEFINE_integer("horizon", None, "Steps of an episode; the envir
 _SEED = flags.DEFINE_integer("seed", None, "Seed of initial states; new ones every time if empty.")
 _RUN = flags.DEFINE_string("run", None, "Run folder, one of whose policies to watch.")
 _TARGET = flags.DEFINE_string("target", "task", "Whose policy of --run: task, strategy_1, ...")
-_CAMERA = flags.DEFINE_string("camera", None, "Name of the camera; the model's first if not given.")
+_CAMERA = flags.DEFINE_string(
+    "camera", None, "Name of the first view; one that follows the robot if there is."
+)
 _WIDTH = flags.DEFINE_integer("width", 800, "Width of pictures in pixels.", lower_bound=64)
 _HEIGHT = flags.DEFINE_integer("height", 600, "Height of pictures in pixels.", lower_bound=64)
 _FPS = flags.DEFINE_float("fps", 20.0, "Pictures a second, at most.", lower_bound=0.1)
@@ -42,7 +45,7 @@ def main(argv: list[str]) -> None:
     path = _OUT.value or f"demonstrations/{name}.npz"
     session = Session(env, path, _HORIZON.value, _SEED.value, policy)
     model = env.engine.model
-    camera = _CAMERA.value or (0 if model.ncam else -1)
+    camera = _CAMERA.value or offscreen.default_camera(model)
     painter = Painter(model, (_WIDTH.value, _HEIGHT.value), camera)
 
     def announce(address: str) -> None:

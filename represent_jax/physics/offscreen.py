@@ -38,9 +38,19 @@ def find_camera(model: mujoco.MjModel, camera: str | int = -1) -> mujoco.MjvCame
     return found
 
 
+def default_camera(model: mujoco.MjModel) -> int:
+    """Returns the index of the first camera that follows the robot, or -1, the free camera.
+
+    Others, such as one in a hand, need not show the whole scene.
+    """
+    modes = (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+    following = np.flatnonzero(np.isin(model.cam_mode, [int(mode) for mode in modes]))
+    return int(following[0]) if following.size else -1
+
+
 @contextlib.contextmanager
 def renderer(
-    model: mujoco.MjModel, size: tuple[int, int]
+    model: mujoco.MjModel, size: tuple[int, int], plain: bool = False
 ) -> Iterator[Callable[[mujoco.MjData, mujoco.MjvCamera], np.ndarray]]:
     """Yields a function from (data, camera) to a frame [height, width, 3], good until the next.
 
@@ -49,6 +59,8 @@ def renderer(
     Args:
         model: the model.
         size: width and height in pixels.
+        plain: whether to leave out shadows, reflections and smoothing, which without a graphics
+            card take most of the time.
 
     Raises:
         RepresentError: no OpenGL library works.
@@ -56,12 +68,17 @@ def renderer(
     model = copy.copy(model)
     width, height = size
     model.vis.global_.offwidth, model.vis.global_.offheight = size
+    if plain:
+        model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
     gl = gl_context(width, height)
     try:
         gl.make_current()
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
         scene = mujoco.MjvScene(model, maxgeom=max(1000, 4 * model.ngeom))
+        if plain:
+            for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+                scene.flags[flag] = 0
         options = mujoco.MjvOption()
         frame, area = np.zeros((height, width, 3), np.uint8), mujoco.MjrRect(0, 0, width, height)
 

@@ -54,7 +54,7 @@ class Live:
         self._keys = HeldKeys()
         self._pace = Pace(session.env.engine.dt)
         self._stepping, self._painting = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
-        self._moving, self._changed = asyncio.Event(), asyncio.Event()
+        self._moving, self._untold, self._unpainted = (asyncio.Event() for _ in range(3))
 
     async def open(self) -> None:
         """Finds out whether pictures can be drawn."""
@@ -63,13 +63,14 @@ class Live:
             self.cameras = self._painter.cameras
         except RepresentError as error:
             self.no_pictures = str(error)
-        self._changed.set()
+        self.refresh()
 
     async def run(self) -> None:
         """Steps and draws until it is cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._drive())
-            tasks.create_task(self._show())
+            tasks.create_task(self._tell())
+            tasks.create_task(self._paint())
 
     async def close(self) -> None:
         """Frees the threads and what they hold."""
@@ -79,7 +80,8 @@ class Live:
 
     def refresh(self) -> None:
         """Has status and picture told once more."""
-        self._changed.set()
+        self._untold.set()
+        self._unpainted.set()
 
     def leave(self) -> None:
         """Releases all keys and pauses the episode: nobody drives any more.
@@ -89,7 +91,7 @@ class Live:
         self._keys.release()
         loop = asyncio.get_running_loop()
         self._stepping.submit(self.session.pause).add_done_callback(
-            lambda _: loop.call_soon_threadsafe(self._changed.set)
+            lambda _: loop.call_soon_threadsafe(self.refresh)
         )
 
     async def obey(self, message: Mapping[str, Any]) -> None:
@@ -137,12 +139,12 @@ class Live:
         finally:
             if self.session.moving:
                 self._moving.set()
-            self._changed.set()
+            self.refresh()
 
     async def _view(self, change: Callable[..., None], *arguments: Any) -> None:
         if not self.no_pictures:
             await self._on_thread(self._painting, change, *arguments)
-            self._changed.set()
+            self.refresh()
 
     async def _drive(self) -> None:
         while True:
@@ -154,26 +156,36 @@ class Live:
                 held_at_steps = [self._keys.take(now) for _ in range(self._pace.due(now))]
                 if held_at_steps:
                     await self._on_thread(self._stepping, self._advance, held_at_steps)
-                    self._changed.set()
+                    self.refresh()
                 await asyncio.sleep(self._pace.wait(time.monotonic()))
 
     def _advance(self, held_at_steps: Sequence[frozenset[str]]) -> None:
         for held in held_at_steps:
             self.session.step(held)
 
-    async def _show(self) -> None:
+    async def _tell(self) -> None:
         while True:
-            await self._changed.wait()
-            self._changed.clear()
-            started = time.monotonic()
-            figures, qpos = await self._on_thread(
-                self._stepping, lambda: (self.session.figures(), self.session.qpos)
-            )
+            started = await self._next(self._untold)
+            figures = await self._on_thread(self._stepping, self.session.figures)
             view = {"camera": self._painter.camera, "speed": self._pace.speed}
             self._on_status(figures | view)
-            if not self.no_pictures:
-                self._on_picture(await self._on_thread(self._painting, self._painter.paint, qpos))
-            await asyncio.sleep(max(0.0, started + self._interval - time.monotonic()))
+            await self._until(started + self._interval)
+
+    async def _paint(self) -> None:
+        while not self.no_pictures:
+            started = await self._next(self._unpainted)
+            qpos = await self._on_thread(self._stepping, lambda: self.session.qpos)
+            self._on_picture(await self._on_thread(self._painting, self._painter.paint, qpos))
+            await self._until(started + self._interval)
+
+    async def _next(self, event: asyncio.Event) -> float:
+        """Waits for news, and returns when they came."""
+        await event.wait()
+        event.clear()
+        return time.monotonic()
+
+    async def _until(self, then: float) -> None:
+        await asyncio.sleep(max(0.0, then - time.monotonic()))
 
     async def _on_thread(
         self, thread: ThreadPoolExecutor, call: Callable[..., Any], *arguments: Any

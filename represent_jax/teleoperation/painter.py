@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import time
 from collections.abc import Callable
 
 import mujoco
@@ -10,6 +11,8 @@ import numpy as np
 from represent_jax.physics import offscreen
 
 _QUALITY = 85
+# A machine that is quicker than this with a plain picture can afford shadows.
+_QUICK_SECONDS = 0.01
 
 
 class Painter:
@@ -36,12 +39,15 @@ class Painter:
         self._resources = contextlib.ExitStack()
 
     def open(self) -> None:
-        """Finds an OpenGL library.
+        """Finds an OpenGL library, and out how well it can draw.
 
         Raises:
             RepresentError: none works.
         """
-        self._draw = self._resources.enter_context(offscreen.renderer(self._model, self.size))
+        self._open(plain=True)
+        if min(self._seconds() for _ in range(3)) < _QUICK_SECONDS:
+            self.close()
+            self._open(plain=False)
 
     def close(self) -> None:
         """Frees what `open` has taken."""
@@ -75,3 +81,13 @@ class Painter:
         self._free.azimuth -= right
         self._free.elevation = np.clip(self._free.elevation - down, -89.0, 89.0)
         self._free.distance *= np.exp(-np.clip(closer, -1.0, 1.0))
+
+    def _open(self, plain: bool) -> None:
+        renderer = offscreen.renderer(self._model, self.size, plain)
+        self._draw = self._resources.enter_context(renderer)
+
+    def _seconds(self) -> float:
+        """Time that a picture takes."""
+        start = time.perf_counter()
+        self.paint(self._model.qpos0)
+        return time.perf_counter() - start

@@ -26,13 +26,16 @@ def read(path: str | os.PathLike, env: base.Env) -> Demonstrations | None:
 
     Raises:
         RepresentError: it is no whole file of demonstrations.
-        UsageError: it is of another environment.
+        UsageError: it is of another environment, or lacks the actions or rewards that episodes
+            driven here have.
     """
     if not Path(path).exists():
         return None
     found = load_demonstrations(path)
     if found.env_name != env.name:
         raise UsageError(f"{path}: demonstrations of {found.env_name}, expected {env.name}")
+    if not (found.has_actions and found.has_rewards):
+        raise UsageError(f"{path}: it lacks actions or rewards; record to another file")
     try:
         found.check_against(env.observation_size, env.action_size, -1.0, 1.0)
     except RepresentError as error:

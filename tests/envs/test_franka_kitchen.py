@@ -170,6 +170,13 @@ def test_outcomes():
     np.testing.assert_array_equal(found["success"], [1.0, 1.0, 0.0, 0.0])
 
 
+def test_the_driver_reads_how_far_the_kettle_is_from_its_goal():
+    env = make_kitchen()
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    (distance,) = env.task.readings(state.pipeline_state).values()
+    assert distance == pytest.approx(np.linalg.norm(state.obs[32:35] - KETTLE_GOAL), abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("keys", "axis", "sign"), [("w", 1, 1), ("s", 1, -1), ("a", 0, -1), ("d", 0, 1), ("q", 2, 1)]
 )

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+_REPOSITORY = Path(__file__).parents[2]
 _FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -25,14 +26,19 @@ SECONDS = 90.0
 
 
 @contextlib.contextmanager
-def launched(env: str, path: Path, *flags: str) -> Iterator[tuple[subprocess.Popen, str]]:
-    """Yields the process of the launcher, and the address it serves; kills it in the end."""
-    command = [sys.executable, "-m", "experiments.teleoperate", f"--env={env}", f"--out={path}"]
+def launched(env: str, folder: Path, *flags: str) -> Iterator[tuple[subprocess.Popen, str]]:
+    """Yields the process of the launcher, and the address it serves; kills it in the end.
+
+    It runs in `folder`, and records to `demonstrations/<env>.npz` there.
+    """
+    command = [sys.executable, "-m", "experiments.teleoperate", f"--env={env}", "--port=0"]
+    path = os.pathsep.join([str(_REPOSITORY), os.environ.get("PYTHONPATH", "")])
     with subprocess.Popen(
-        [*command, "--port=0", *flags],
+        [*command, *flags],
         stdout=subprocess.PIPE,
         text=True,
-        env=os.environ | {"JAX_PLATFORMS": "cpu"},
+        cwd=folder,
+        env=os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": path},
     ) as process:
         try:
             line = process.stdout.readline()
@@ -76,9 +82,10 @@ class TeleoperationPage:
         return self.driver.find_element("id", element).text
 
     def click(self, element: str) -> None:
-        """Clicks an element that may have to become enabled first."""
-        self.until(lambda: self.driver.find_element("id", element).is_enabled())
-        self.driver.find_element("id", element).click()
+        """Clicks an element that may have to be shown and enabled first."""
+        found = self.driver.find_element("id", element)
+        self.until(lambda: found.is_displayed() and found.is_enabled())
+        found.click()
 
     def choose(self, element: str, value: str) -> None:
         """Chooses an option by its value."""

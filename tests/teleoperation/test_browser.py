@@ -18,10 +18,10 @@ def drive_until_over(page, key):
 
 
 def test_keys_in_a_browser_move_the_robot_and_episodes_are_saved(tmp_path):
-    path = tmp_path / "mine.npz"
+    path = tmp_path / "demonstrations" / "inverted_double_pendulum.npz"
     with (
         chromium(tmp_path / "profile") as driver,
-        launched("inverted_double_pendulum", path, "--seed=1", "--horizon=60") as (_, address),
+        launched("inverted_double_pendulum", tmp_path, "--seed=1", "--horizon=60") as (_, address),
     ):
         from selenium.webdriver.common.keys import Keys
 
@@ -66,7 +66,7 @@ def test_keys_in_a_browser_move_the_robot_and_episodes_are_saved(tmp_path):
 def test_the_page_says_when_the_server_is_gone(tmp_path):
     with (
         chromium(tmp_path / "profile") as driver,
-        launched("hopper", tmp_path / "none.npz") as (process, address),
+        launched("hopper", tmp_path) as (process, address),
     ):
         driver.get(address)
         page = TeleoperationPage(driver)

@@ -3,12 +3,11 @@
 import asyncio
 import contextlib
 import json
-import os
 import signal
-import subprocess
 import sys
 
 import pytest
+from browser import launched
 
 from represent_jax.data import load_demonstrations
 from represent_jax.envs import make_env
@@ -241,23 +240,6 @@ def test_a_port_that_is_taken_is_refused(env, tmp_path):
     asyncio.run(scenario())
 
 
-@contextlib.contextmanager
-def launched(path, *flags):
-    """Yields the process of the launcher and the address it serves."""
-    command = [sys.executable, "-m", "experiments.teleoperate", "--env=inverted_double_pendulum"]
-    options = ["--port=0", "--width=96", "--height=64", f"--out={path}"]
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
-    with subprocess.Popen(
-        [*command, *options, *flags], stdout=subprocess.PIPE, text=True, env=environment
-    ) as process:
-        try:
-            line = process.stdout.readline()
-            assert line.startswith("Drive at http://localhost:"), line
-            yield process, line.split()[2]
-        finally:
-            process.kill()
-
-
 async def _save_one(address):
     async with aiohttp.ClientSession() as client:
         async with client.ws_connect(f"{address}/live") as socket:
@@ -272,14 +254,14 @@ async def _save_one(address):
 
 
 def test_a_killed_server_loses_no_saved_episode(tmp_path):
-    path = tmp_path / "mine.npz"
+    path = tmp_path / "demonstrations" / "inverted_double_pendulum.npz"
 
     async def scenario(process, address):
         async for _ in _save_one(address):
             process.send_signal(signal.SIGKILL)
             process.wait(SECONDS)
 
-    with launched(path) as (process, address):
+    with launched("inverted_double_pendulum", tmp_path) as (process, address):
         asyncio.run(scenario(process, address))
         assert process.returncode == -signal.SIGKILL
     assert len(load_demonstrations(path).trajectories) == 1
@@ -292,6 +274,6 @@ def test_an_interrupt_ends_the_server_cleanly(tmp_path):
             with pytest.raises(ConnectionError, match="1001"):
                 await driver.until(lambda heard: False)
 
-    with launched(tmp_path / "mine.npz") as (process, address):
+    with launched("inverted_double_pendulum", tmp_path) as (process, address):
         asyncio.run(scenario(process, address))
         assert process.wait(SECONDS) == 0

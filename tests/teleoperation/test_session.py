@@ -187,6 +187,13 @@ def test_a_file_of_another_environment_is_refused(env, session):
         Session(hopper, session.path)
 
 
+def test_a_file_without_actions_is_refused_before_anybody_drives(env, tmp_path):
+    states = Trajectory(np.zeros((3, env.observation_size)), None, None, False, 0)
+    save_demonstrations(tmp_path / "states.npz", Demonstrations(env.name, (states,)))
+    with pytest.raises(UsageError, match="lacks actions or rewards"):
+        Session(env, tmp_path / "states.npz")
+
+
 @pytest.mark.parametrize("command", ["resume", "discard"])
 def test_commands_that_do_not_fit_are_refused(session, command):
     with pytest.raises(UsageError, match="found ready"):

@@ -132,5 +132,9 @@ class FrankaKitchen(Task):
         success = (distance < _REACHED) & upright
         return {"kettle_distance": distance, "success": success.astype(jnp.float32)}
 
+    def readings(self, physics: PhysicsState) -> dict[str, jax.Array]:
+        goal = jnp.asarray(KETTLE_GOAL, jnp.float32)
+        return {"kettle to its goal, m": jnp.linalg.norm(physics.qpos[-7:-4] - goal)}
+
     def keyboard(self, model: mujoco.MjModel) -> KitchenKeyboard:
         return KitchenKeyboard(model)
