@@ -157,7 +157,8 @@ def _videos(shown: showcase.Showcase | None) -> str:
             for panel in video.panels
         )
         parts.append(
-            f"<figure><h3>{text(display_name(video.target))}</h3>"
+            f'<figure style="max-width:{380 * len(video.panels)}px">'
+            f"<h3>{text(display_name(video.target))}</h3>"
             f'<video src="{text(video.file)}" controls loop muted playsinline></video>'
             f"<figcaption>{panels}</figcaption></figure>"
         )

@@ -96,7 +96,7 @@ def motion(
 
 def make(
     run: RunDirectory,
-    env: Environment,
+    env: base.Env,
     horizon: int,
     demonstrations: Demonstrations,
     group_names: Sequence[str],
@@ -114,10 +114,14 @@ def make(
         load_policies: returns the policies, by target; called where videos can be made at all.
         seed: of the policies' initial state.
     """
-    demonstrated, notices = _demonstrated(env, demonstrations, group_names)
-    videos = []
+    demonstrated, notices, videos = {}, [], []
     try:
+        if not isinstance(env, Environment):
+            raise RepresentError(
+                f"only tasks on this package's engines can be shown, not {env.name}"
+            )
         video.check_available()
+        demonstrated, notices = _demonstrated(env, demonstrations, group_names)
         for target, policy in load_policies().items():
             qpos, rewards = motion(
                 Episode(env, horizon, auto_reset=False), policy, jax.random.PRNGKey(seed), horizon

@@ -55,8 +55,14 @@ def blocks_of(path):
 
 
 def commands(block):
-    """Returns the command lines of a block, each as words; comments and output are left out."""
+    """Returns the command lines of a block, each as words; beside bash, other lines are left out.
+
+    What starts a launcher on a cluster (srun) is left out too.
+    """
     lines = block.text.replace("\\\n", " ").splitlines()
+    if block.language != "bash":
+        lines = [line.removeprefix("srun ") for line in lines]
+        lines = [line for line in lines if line.startswith(("python ", "make ", "pip "))]
     return [words for line in lines if (words := shlex.split(line, comments=True))]
 
 

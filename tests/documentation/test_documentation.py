@@ -58,8 +58,7 @@ def run_page(path, folder, namespace=None):
                     shutil.copytree(folder / "runs" / "demo", folder / out)
         elif block.language != "text":
             for words in blocks.commands(block):
-                if words[0] in ("python", "make", "pip"):
-                    blocks.run_command(words, parse_only=True)
+                blocks.run_command(words, parse_only=True)
     return namespace
 
 
