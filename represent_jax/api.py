@@ -67,14 +67,15 @@ def infer_strategies(
     Args:
       demonstrations: the pool.
       num_strategies: how many strategies there are; 0 if that is to be found out.
-      seed: seed of the random features and of the resamples.
+      seed: seed of what is drawn where actions are missing; without effect elsewhere.
 
     Returns:
       The same demonstrations with strategies numbered by first appearance; the metadata holds the
       confidence of each trajectory's label, under "inferred_strategies".
 
     Raises:
-      RepresentError: a trajectory is too short to tell.
+      RepresentError: more strategies are asked for than there are trajectories, or one without
+        actions is too short to tell.
     """
     config = strategies.StrategiesConfig(num_strategies=num_strategies)
     found = strategies.infer(jax.random.PRNGKey(seed), demonstrations.trajectories, config)

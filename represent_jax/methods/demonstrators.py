@@ -18,7 +18,13 @@ from represent_jax.agents import sac
 from represent_jax.agents.rollout import rollout
 from represent_jax.agents.sac import SacConfig
 from represent_jax.config import require
-from represent_jax.data.trajectories import Trajectory, TrajectoryBatch, returns, unpad
+from represent_jax.data.trajectories import (
+    Demonstrations,
+    Trajectory,
+    TrajectoryBatch,
+    returns,
+    unpad,
+)
 from represent_jax.envs import Episode, make_env
 from represent_jax.errors import RepresentError
 from represent_jax.runs.loop import advance
@@ -288,3 +294,23 @@ def choose_test_set(
             one = jax.tree.map(lambda x, skill=skill: x[skill], batch)
             trajectories += unpad(one._replace(strategy=np.full_like(one.strategy, skill)))
     return trajectories
+
+
+def by_agent(test: Demonstrations) -> Demonstrations:
+    """Relabels a test set by who acted: one skill of one snapshot is one agent.
+
+    Only the second half of training is kept: untrained skills all act alike.
+
+    Raises:
+      RepresentError: the file does not say how many trajectories each agent has.
+    """
+    each = test.metadata.get("config", {}).get("test_trajectories_per_skill")
+    if not each or len(test.trajectories) % each:
+        raise RepresentError(
+            f"test set of {test.env_name}: metadata: expected config.test_trajectories_per_skill, "
+            f"a divisor of its {len(test.trajectories)} trajectories, found {each}"
+        )
+    num_agents = len(test.trajectories) // each
+    late = test.trajectories[num_agents // 2 * each :]
+    own = tuple(dataclasses.replace(t, strategy=i // each) for i, t in enumerate(late))
+    return dataclasses.replace(test, trajectories=own)

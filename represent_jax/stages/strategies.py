@@ -1,16 +1,14 @@
 """Strategies of demonstrations that nobody labelled: how many there are, and whose is whose.
 
-A demonstrator's strategy shows in how the robot moves: in the distribution of one-step changes of
-the observation. Every trajectory is described by the mean of random Fourier features of these
-changes (Rahimi and Recht, NeurIPS 2007), so that the distance between two descriptions is the
-maximum mean discrepancy between the two motions (Gretton et al., JMLR 2012), and Ward's clustering
-of the descriptions gives the strategies.
+A strategy is a way to choose actions, so that trajectories are a mixture of policies
+(`stages.policy_mixture`), and the number of strategies is that of the highest evidence. Two things
+keep evidence that comes from simple policies honest:
 
-Their number is the largest with which the two halves of the same trajectories, clustered each by
-itself, agree: the prediction strength of Tibshirani and Walther (2005), for which no labels are
-needed, since the halves of an episode have one demonstrator. Halves are drawn anew in blocks of
-steps, so that a few trajectories cannot agree by chance. A strategy is believed only if at least
-two trajectories show it.
+- The two halves of a trajectory are of one strategy by definition. By as many times as they differ
+  more than noise explains, the evidence is tempered; it needs no labels to know.
+- How far strategies lie from each other is averaged over.
+
+Demonstrations that lack actions are told apart by how the robot moves (`stages.motion_clusters`).
 """
 
 import dataclasses
@@ -19,15 +17,14 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.optimize import linear_sum_assignment
+from scipy.special import logsumexp
 
 from represent_jax.config import require
 from represent_jax.data.trajectories import Demonstrations, Trajectory
 from represent_jax.errors import RepresentError
-
-# Changes beyond this many standard deviations, as of a fall, count as this many.
-_MAX_DEVIATIONS = 5.0
+from represent_jax.stages import motion_clusters, policy_mixture
+from represent_jax.stages.motion_clusters import MotionConfig
+from represent_jax.stages.policy_mixture import Model, Moments
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,29 +34,29 @@ class StrategiesConfig:
     Attributes:
       num_strategies: how many there are; 0 if that is to be found out.
       max_strategies: the most to be looked for.
-      min_strength: prediction strength from which a number of strategies is believed. At 0.5 most
-        pairs of every strategy are together in both halves; where nothing is drawn anew,
-        Tibshirani and Walther advise 0.8 to 0.9.
-      num_features: random Fourier features.
-      bandwidth: width of their kernel in units of the median distance between changes.
-      block_steps: steps that are drawn together when trajectories are resampled.
-      num_resamples: resamples behind the strengths, and behind the confidences.
+      prior_steps: how many typical steps the prior of a strategy's policy is worth, which is
+        centred at the policy of all demonstrations. Few let strategies lie far apart, many hold
+        them together; the evidence is averaged over these.
+      concentration: of the Dirichlet prior of the strategies' shares of the trajectories.
+      motion: settings where actions are missing.
     """
 
     num_strategies: int = 0
     max_strategies: int = 12
-    min_strength: float = 0.5
-    num_features: int = 512
-    bandwidth: float = 0.25
-    block_steps: int = 10
-    num_resamples: int = 100
+    prior_steps: tuple[float, ...] = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+    concentration: float = 1.0
+    motion: MotionConfig = MotionConfig()
 
     def __post_init__(self) -> None:
         require(self.num_strategies >= 0, "num_strategies", "at least 0", self.num_strategies)
-        require(0.0 < self.min_strength <= 1.0, "min_strength", "in (0, 1]", self.min_strength)
-        require(self.bandwidth > 0.0, "bandwidth", "positive", self.bandwidth)
-        for field in ("max_strategies", "num_features", "block_steps", "num_resamples"):
-            require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
+        require(self.max_strategies >= 1, "max_strategies", "at least 1", self.max_strategies)
+        require(
+            bool(self.prior_steps) and all(steps > 0.0 for steps in self.prior_steps),
+            "prior_steps",
+            "one or more positive numbers",
+            self.prior_steps,
+        )
+        require(self.concentration > 0.0, "concentration", "positive", self.concentration)
 
 
 class Strategies(NamedTuple):
@@ -67,15 +64,20 @@ class Strategies(NamedTuple):
 
     Attributes:
       labels: strategy of every trajectory, numbered by first appearance, `[num_trajectories]` int.
-      probabilities: share of resamples in which a trajectory falls to each strategy,
-        `[num_trajectories, num_strategies]`.
-      strengths: prediction strength of 1, 2, ... strategies, mean over resamples,
-        `[most looked for]`.
+      probabilities: probability of each strategy given the labels of all other trajectories, or,
+        where actions are missing, share of resamples, `[num_trajectories, num_strategies]`.
+      criterion: how well 1, 2, ... strategies do, nan where a number was not looked at,
+        `[most looked at]`: their tempered log evidence, less the highest; where actions are
+        missing, the agreement of the halves of trajectories.
+      overdispersion: by how many times the halves of a trajectory differ more than noise explains;
+        evidence and probabilities are tempered by it where it is above 1. 1 where actions are
+        missing.
     """
 
     labels: np.ndarray
     probabilities: np.ndarray
-    strengths: np.ndarray
+    criterion: np.ndarray
+    overdispersion: float
 
     @property
     def num_strategies(self) -> int:
@@ -88,37 +90,71 @@ class Strategies(NamedTuple):
         return self.probabilities[np.arange(len(self.labels)), self.labels]
 
 
+class _Division(NamedTuple):
+    log_joint: float
+    labels: np.ndarray
+    model: Model
+
+
 def infer(
     key: jax.Array, trajectories: Sequence[Trajectory], config: StrategiesConfig
 ) -> Strategies:
     """Infers the strategies of trajectories; the strategies they name are not looked at.
 
     Args:
-      key: PRNG key.
-      trajectories: the pool, in any order, lengths may differ; rewards and actions are not used.
+      key: PRNG key; without effect where actions are known, since nothing is drawn then.
+      trajectories: the pool, in any order, lengths may differ; all have actions, or none has.
+        Rewards are not used.
       config: settings.
 
     Raises:
-      RepresentError: there are no trajectories, one is shorter than two steps, or more strategies
-        are asked for than there are trajectories.
+      RepresentError: there are no trajectories, more strategies are asked for than there are
+        trajectories, or one without actions is shorter than two steps.
     """
-    if not len(trajectories):
+    num = len(trajectories)
+    if not num:
         raise RepresentError("trajectories: expected at least 1, found none")
-    if config.num_strategies > len(trajectories):
+    if config.num_strategies > num:
         raise RepresentError(
-            f"num_strategies: expected at most {len(trajectories)}, the number of trajectories, "
+            f"num_strategies: expected at most {num}, the number of trajectories, "
             f"found {config.num_strategies}"
         )
-    key_features, key_halves, key_wholes = jax.random.split(key, 3)
-    features = _features(key_features, _changes(trajectories), config)
-    most = max(1, min(config.max_strategies, len(trajectories) // 2))
-    strengths = _strengths(_rng(key_halves), features, most, config)
-    found = 1 + int(np.flatnonzero(strengths >= config.min_strength)[-1])
-    number = config.num_strategies or found
-    tree = _tree(np.stack([rows.mean(axis=0) for rows in features]))
-    labels = _by_appearance(_cut(tree, number))
-    probabilities = _probabilities(_rng(key_wholes), features, labels, number, config)
-    return Strategies(labels, probabilities, strengths)
+    if trajectories[0].actions is None:
+        found = motion_clusters.cluster(
+            key, trajectories, config.motion, config.num_strategies, config.max_strategies
+        )
+        labels, order = _by_appearance(found.labels)
+        return Strategies(labels, found.probabilities[:, order], found.strengths, 1.0)
+    return _by_policy(trajectories, config)
+
+
+def _by_policy(trajectories: Sequence[Trajectory], config: StrategiesConfig) -> Strategies:
+    num = len(trajectories)
+    numbers = [config.num_strategies]
+    if not config.num_strategies:
+        numbers = list(range(1, min(config.max_strategies, num) + 1))
+    halves, pooled = policy_mixture.moments_of(trajectories)
+    overdispersion = policy_mixture.overdispersion(halves, pooled)
+    moments = Moments(*(x / max(1.0, overdispersion) for x in halves.summed(1)))
+    degrees = float(moments.weight.sum()) + len(pooled.noise) + 2
+    divisions: dict[int, list[_Division]] = {number: [] for number in numbers}
+    for steps in config.prior_steps:
+        model = Model(steps * pooled.step, pooled.noise, degrees, config.concentration)
+        for start in policy_mixture.merge(moments, model, numbers):
+            labels = policy_mixture.settle(start, moments, model)
+            log_joint = policy_mixture.log_joint(labels, moments, model)
+            divisions[labels.max() + 1].append(_Division(log_joint, labels, model))
+    log_evidence = np.full(max(numbers), np.nan)
+    for number, own in divisions.items():
+        log_evidence[number - 1] = logsumexp([one.log_joint for one in own]) - np.log(len(own))
+    log_evidence -= np.nanmax(log_evidence)
+    best = max(divisions[1 + int(np.nanargmax(log_evidence))], key=lambda one: one.log_joint)
+    labels, _ = _by_appearance(best.labels)
+    scores = np.stack(
+        [policy_mixture.label_scores(i, labels, moments, best.model) for i in range(num)]
+    )
+    probabilities = np.exp(scores - logsumexp(scores, axis=1, keepdims=True))
+    return Strategies(labels, probabilities, log_evidence, overdispersion)
 
 
 def label(demonstrations: Demonstrations, strategies: Strategies) -> Demonstrations:
@@ -129,7 +165,10 @@ def label(demonstrations: Demonstrations, strategies: Strategies) -> Demonstrati
     ]
     inferred = {
         "confidence": strategies.confidence.round(4).tolist(),
-        "strengths": strategies.strengths.round(4).tolist(),
+        "criterion": [
+            None if np.isnan(value) else round(float(value), 4) for value in strategies.criterion
+        ],
+        "overdispersion": round(strategies.overdispersion, 4),
     }
     return dataclasses.replace(
         demonstrations,
@@ -158,122 +197,14 @@ def adjusted_rand(labels: np.ndarray, known: np.ndarray) -> float:
     return 1.0 if most == expected else (together - expected) / (most - expected)
 
 
-def _changes(trajectories: Sequence[Trajectory]) -> list[np.ndarray]:
-    """One-step changes of every trajectory in units of their spread, `[num_steps, obs_dim]`."""
-    changes = [np.diff(t.obs.astype(np.float64), axis=0) for t in trajectories]
-    for i, rows in enumerate(changes):
-        if len(rows) < 2:
-            raise RepresentError(f"trajectory {i}: expected at least 2 steps, found {len(rows)}")
-    pooled = np.concatenate(changes)
-    mean, spread = pooled.mean(axis=0), pooled.std(axis=0)
-    # What never changes tells nothing; what hardly changes must not be blown up.
-    scale = np.where(spread > 1e-8, spread, np.inf)
-    return [np.clip((x - mean) / scale, -_MAX_DEVIATIONS, _MAX_DEVIATIONS) for x in changes]
+def _by_appearance(labels: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """Numbers groups in the order in which trajectories first show them; which was which before."""
+    order = list(dict.fromkeys(labels.tolist()))
+    return np.array([order.index(group) for group in labels.tolist()]), order
 
 
-def _features(
-    key: jax.Array, changes: list[np.ndarray], config: StrategiesConfig
-) -> list[np.ndarray]:
-    """Random Fourier features of every step, `[num_steps, 2 * num_features]`."""
-    key_pairs, key_frequencies = jax.random.split(key)
-    pooled = np.concatenate(changes)
-    first, second = np.asarray(jax.random.randint(key_pairs, (2, 2000), 0, len(pooled)))
-    distance = np.median(np.linalg.norm(pooled[first] - pooled[second], axis=1))
-    width = config.bandwidth * max(float(distance), 1e-8)
-    shape = (pooled.shape[1], config.num_features)
-    frequencies = np.asarray(jax.random.normal(key_frequencies, shape), np.float64) / width
-    phases = [x @ frequencies for x in changes]
-    scale = np.sqrt(config.num_features)
-    return [np.concatenate([np.cos(p), np.sin(p)], axis=1) / scale for p in phases]
-
-
-def _rng(key: jax.Array) -> np.random.Generator:
-    return np.random.default_rng(np.asarray(jax.random.key_data(key)))
-
-
-def _tree(descriptions: np.ndarray) -> np.ndarray | None:
-    """Ward's tree of `[num_trajectories, dim]`; None for a single one."""
-    return linkage(descriptions, "ward") if len(descriptions) > 1 else None
-
-
-def _cut(tree: np.ndarray | None, number: int) -> np.ndarray:
-    """The partition of a tree into a number of clusters, `[num_trajectories]`."""
-    return np.zeros(1, int) if tree is None else fcluster(tree, number, "maxclust") - 1
-
-
-def _blocks(rows: np.ndarray, config: StrategiesConfig) -> np.ndarray:
-    """Mean features of consecutive blocks of steps, `[num_blocks, dim]`."""
-    parts = np.array_split(rows, -(-len(rows) // config.block_steps))
-    return np.stack([part.mean(axis=0) for part in parts])
-
-
-def _drawn(rng: np.random.Generator, blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """A description of every trajectory from blocks drawn with replacement."""
-    return np.stack([b[rng.integers(len(b), size=len(b))].mean(axis=0) for b in blocks])
-
-
-def _strengths(
-    rng: np.random.Generator, features: list[np.ndarray], most: int, config: StrategiesConfig
-) -> np.ndarray:
-    """How well the clusters of each half foretell those of the other, by their number, `[most]`.
-
-    What counts is the cluster that is foretold worst: of its pairs, the share that is together in
-    the other half too. A cluster of one has no pair, and foretells nothing.
-    """
-    middles = [len(rows) // 2 for rows in features]
-    halves = [
-        [_blocks(rows[:middle], config) for rows, middle in zip(features, middles, strict=True)],
-        [_blocks(rows[middle:], config) for rows, middle in zip(features, middles, strict=True)],
-    ]
-    strengths = np.ones(most)
-    if most > 1:
-        strengths[1:] = 0.0
-        for _ in range(config.num_resamples):
-            trees = [_tree(_drawn(rng, blocks)) for blocks in halves]
-            for number in range(2, most + 1):
-                one, other = (_cut(tree, number) for tree in trees)
-                strengths[number - 1] += min(_foretold(one, other), _foretold(other, one))
-        strengths[1:] /= config.num_resamples
-    return strengths
-
-
-def _foretold(labels: np.ndarray, by: np.ndarray) -> float:
-    shares = []
-    for cluster in range(labels.max() + 1):
-        members = by[labels == cluster]
-        num_pairs = len(members) * (len(members) - 1)
-        together = (members[:, None] == members[None, :]).sum() - len(members)
-        shares.append(together / num_pairs if num_pairs else 0.0)
-    return float(min(shares))
-
-
-def _by_appearance(labels: np.ndarray) -> np.ndarray:
-    """Numbers clusters in the order in which the trajectories first show them."""
-    order = {cluster: i for i, cluster in enumerate(dict.fromkeys(labels.tolist()))}
-    return np.array([order[cluster] for cluster in labels.tolist()])
-
-
-def _probabilities(
-    rng: np.random.Generator,
-    features: list[np.ndarray],
-    labels: np.ndarray,
-    number: int,
-    config: StrategiesConfig,
-) -> np.ndarray:
-    """Clusters resampled trajectories, and counts which falls where."""
-    blocks = [_blocks(rows, config) for rows in features]
-    votes = np.zeros((len(labels), number))
-    for _ in range(config.num_resamples):
-        again = _cut(_tree(_drawn(rng, blocks)), number)
-        here, there = linear_sum_assignment(-_contingency(again, labels, number))
-        names = np.zeros(number, int)
-        names[here] = there
-        votes[np.arange(len(labels)), names[again]] += 1.0
-    return votes / config.num_resamples
-
-
-def _contingency(labels: np.ndarray, known: np.ndarray, number: int = 0) -> np.ndarray:
+def _contingency(labels: np.ndarray, known: np.ndarray) -> np.ndarray:
     """How many trajectories have each label (row) and each known strategy (column)."""
-    table = np.zeros((number or labels.max() + 1, number or known.max() + 1))
+    table = np.zeros((labels.max() + 1, known.max() + 1))
     np.add.at(table, (labels, known), 1.0)
     return table
