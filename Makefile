@@ -35,7 +35,7 @@ demo: $(VENV)/.installed ## demonstrations of two imperfect cheetahs -> rewards,
 	@echo "Report: $(DEMO_OUT)/report.html (open it in a browser)"
 
 test: lint ## ruff, then the whole test suite
-	@$(RUN) pytest -n 2 --dist loadscope
+	@$(RUN) pytest -n 2 --dist loadscope --no-loadscope-reorder
 
 test-extras: $(VENV)/.installed-extras ## tests that need optional libraries: Ray, Stable-Baselines3
 	@$(RUN) pytest -m extras

@@ -5,6 +5,7 @@ to REPRESENT, SSRR and D-REX only.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
@@ -62,10 +63,12 @@ def plan(
         def policy(params, obs_t, key):
             return msrd.act(params, obs_t, key, config.msrd, env.action_size, deterministic=True)
 
+        levels = jnp.zeros(results.FINAL_EPISODES)
+        roll_out = jax.jit(lambda params, key: rollouts.rollout(env, policy, params, key, levels))
+
         def episodes_of(strategy):
             params = jax.tree.map(lambda x: x[strategy], output.policies)
-            levels = jnp.zeros(results.FINAL_EPISODES)
-            return jax.jit(lambda key: rollouts.rollout(env, policy, params, key, levels))
+            return functools.partial(roll_out, params)
 
         episodes = {name: episodes_of(i) for i, name in enumerate(config.group_names)}
         learned = results.learned_returns(_rewards_of(config, output))

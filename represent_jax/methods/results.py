@@ -7,6 +7,7 @@ environment's own reward.
 This is the only place where the true reward is looked at.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -126,10 +127,11 @@ def agents_episodes(
 ) -> dict[str, Episodes]:
     """Deterministic episodes of trained agents, by target."""
 
-    def episodes_of(policy):
-        return jax.jit(lambda key: policies.rollout(key, env, policy, FINAL_EPISODES, config))
-
-    return {name: episodes_of(trained.policy(i)) for i, name in enumerate(names)}
+    # One program for all targets: compiling the physics takes longer than the episodes.
+    roll_out = jax.jit(
+        lambda policy, key: policies.rollout(key, env, policy, FINAL_EPISODES, config)
+    )
+    return {name: functools.partial(roll_out, trained.policy(i)) for i, name in enumerate(names)}
 
 
 def describe_curves(curves: curve.Curve) -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ import pytest
 import represent_jax as rj
 
 pytest.importorskip("stable_baselines3")
+pytestmark = pytest.mark.extras
 
 
 def test_sac_of_stable_baselines3_learns_on_a_learned_reward(tmp_path, monkeypatch):

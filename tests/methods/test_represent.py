@@ -1,53 +1,23 @@
-"""The whole pipeline with tiny budgets: every stage, both engines, killed and resumed."""
+"""The whole pipeline with tiny budgets: every stage, killed and resumed, and what it leaves."""
 
 import dataclasses
 import json
-import os
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from launcher import ROOT, finish, launch, log_of, results_of
 
 import represent_jax as rj
 from represent_jax.errors import RepresentError, UsageError
 from represent_jax.methods.config import make_problem
 from represent_jax.methods.presets import make_config
 
-ROOT = Path(__file__).parents[2]
-# The task whose physics MJX compiles soonest.
-IN_XLA = ("--env=inverted_double_pendulum", "--backend=mjx")
-
-
-def _launch(out, *flags, cache=None):
-    """Starts the launcher; `cache` keeps compiled programs (those with host callbacks never)."""
-    command = [sys.executable, "-m", "experiments.represent", "--preset=smoke", f"--out={out}"]
-    # Tiny programs run once: their time is the compiler's.
-    quick = {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
-    environment = os.environ | quick | {"JAX_PLATFORMS": "cpu"}
-    if cache is not None:
-        environment |= {
-            "JAX_COMPILATION_CACHE_DIR": str(cache),
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        }
-    return subprocess.Popen(
-        [*command, *flags],
-        cwd=ROOT,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def _finish(process):
-    output, _ = process.communicate(timeout=600)
-    assert process.returncode == 0, output
-    return output
+PENDULUM = ("--env=inverted_double_pendulum", "--backend=mujoco")
 
 
 @pytest.fixture(scope="module")
@@ -57,21 +27,11 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory, cache):
-    """A whole run in pure XLA, from demonstrations to policies."""
+    """A whole run, from demonstrations to policies."""
     out = tmp_path_factory.mktemp("run") / "whole"
     record = out.parent / "records.jsonl"
-    output = _finish(_launch(out, *IN_XLA, f"--record={record}", cache=cache))
+    output = finish(launch(out, *PENDULUM, f"--record={record}", cache=cache))
     return out, record, output
-
-
-def _results(run):
-    """What a run found, without what may differ between two runs of it."""
-    results = json.loads((run / "results.json").read_text())
-    return {k: v for k, v in results.items() if k not in ("seconds", "peak_memory_gib")}
-
-
-def _log(run):
-    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
 
 
 def test_run_directory_has_everything(finished):
@@ -79,7 +39,7 @@ def test_run_directory_has_everything(finished):
     for name in ("config.json", "metrics.jsonl", "results.json", "report.html"):
         assert (out / name).stat().st_size > 0
     assert list((out / "tensorboard").rglob("events*"))
-    results = _results(out)
+    results = results_of(out)
     assert set(results["policies"]) == {"task", "strategy_1", "strategy_2"}
     assert set(results["rewards"]) == {"task", "strategy_1", "strategy_2"}
     assert "report:" in output
@@ -91,9 +51,9 @@ def test_run_directory_has_everything(finished):
 def test_killed_at_three_points_and_resumed_ends_in_the_same_results(finished, cache, tmp_path):
     whole, _, _ = finished
     out = tmp_path / "killed"
-    flags = (*IN_XLA, "--resume", "--checkpoint_seconds=0")
+    flags = (*PENDULUM, "--resume", "--checkpoint_seconds=0")
     for stage in ("airl", "regression", "policies"):
-        process = _launch(out, *flags, cache=cache)
+        process = launch(out, *flags, cache=cache)
         deadline = time.monotonic() + 300
         progress = out / "checkpoints" / stage / "progress"
         while process.poll() is None and time.monotonic() < deadline:
@@ -102,46 +62,18 @@ def test_killed_at_three_points_and_resumed_ends_in_the_same_results(finished, c
             time.sleep(0.02)
         process.send_signal(signal.SIGKILL)
         process.communicate()
-    _finish(_launch(out, *flags, cache=cache))
-    assert _results(out) == _results(whole)
-    steps = [line["step"] for line in _log(out) if line["stage"] == "policies"]
+    finish(launch(out, *flags, cache=cache))
+    assert results_of(out) == results_of(whole)
+    steps = [line["step"] for line in log_of(out) if line["stage"] == "policies"]
     assert steps == sorted(set(steps))
 
 
 def test_a_run_can_stop_behind_a_stage(tmp_path):
     out = tmp_path / "part"
-    output = _finish(_launch(out, "--backend=mujoco", "--env=hopper", "--until=noise"))
+    output = finish(launch(out, "--backend=mujoco", "--env=hopper", "--until=noise"))
     assert "done until noise" in output
     assert not (out / "results.json").exists()
-    assert {line["stage"] for line in _log(out)} == {"airl", "clock"}
-
-
-def test_ssrr_on_one_strategy_with_ppo_throughout(tmp_path):
-    out, record = tmp_path / "alone", tmp_path / "records.jsonl"
-    overrides = ("grouping=strategy_2", "airl.agent=ppo", "policies.agent=ppo")
-    flags = [f"--override={one}" for one in overrides]
-    _finish(_launch(out, "--method=ssrr", "--backend=mujoco", f"--record={record}", *flags))
-    assert set(_results(out)["policies"]) == {"strategy_2"}
-    lines = [json.loads(line) for line in record.read_text().splitlines()]
-    assert {line["method"] for line in lines} == {"ssrr"}
-    assert {line["target"] for line in lines} == {"strategy_2"}
-    obs, action = np.zeros((3, 17), np.float32), np.zeros((3, 6), np.float32)
-    assert rj.load_reward(out)(obs, action, obs, "strategy_2").shape == (3,)
-    assert rj.load_policy(out, "strategy_2")(obs).shape == (3, 6)
-
-
-def test_a_policy_for_some_of_the_targets(tmp_path):
-    out = tmp_path / "task_only"
-    overrides = ("policy_targets=task", "num_strategies=1")
-    flags = [f"--override={one}" for one in overrides]
-    _finish(_launch(out, "--backend=mujoco", "--env=inverted_double_pendulum", *flags))
-    results = _results(out)
-    assert set(results["rewards"]) == {"task", "strategy_1"}
-    assert set(results["policies"]) == {"task"}
-    obs = np.zeros((3, 11), np.float32)
-    assert rj.load_policy(out)(obs).shape == (3, 1)
-    with pytest.raises(UsageError, match="task"):
-        rj.load_policy(out, "strategy_1")
+    assert {line["stage"] for line in log_of(out)} == {"airl", "clock"}
 
 
 def test_merged_demonstrations_are_those_of_one_strategy():
@@ -158,30 +90,6 @@ def test_merged_demonstrations_are_those_of_one_strategy():
     assert config.target_names == ("task",)
 
 
-@pytest.mark.parametrize("method", ["drex", "msrd", "bc", "bc_rnn"])
-def test_baselines_run_to_their_end(tmp_path, method):
-    record = tmp_path / "records.jsonl"
-    out = tmp_path / method
-    _finish(_launch(out, f"--method={method}", "--backend=mujoco", f"--record={record}"))
-    results = _results(out)
-    finals = [policy["return_final"] for policy in results["policies"].values()]
-    assert finals and np.isfinite(finals).all()
-    lines = [json.loads(line) for line in record.read_text().splitlines()]
-    assert {line["method"] for line in lines} == {method}
-    obs, action = np.zeros((3, 17), np.float32), np.zeros((3, 6), np.float32)
-    if method in ("drex", "msrd"):
-        assert rj.load_reward(out)(obs, action, obs).shape == (3,)
-    else:
-        with pytest.raises(RepresentError, match="no reward"):
-            rj.load_reward(out)
-    if method == "bc_rnn":
-        with pytest.raises(RepresentError, match="hidden state"):
-            rj.load_policy(out)
-    else:
-        target = next(iter(results["policies"]))
-        assert rj.load_policy(out, target)(obs).shape == (3, 6)
-
-
 def test_evaluate_judges_a_finished_run(finished):
     out, _, _ = finished
     command = [sys.executable, "-m", "experiments.evaluate", f"--run={out}", "--backend=mujoco"]
@@ -190,7 +98,7 @@ def test_evaluate_judges_a_finished_run(finished):
     )
     assert shown.returncode == 0, shown.stderr
     by_target = {line.split("  ")[0]: line.split() for line in shown.stdout.splitlines()}
-    found = _results(out)["rewards"]["task"]["pearson_test"]
+    found = results_of(out)["rewards"]["task"]["pearson_test"]
     # The run's own test trajectories are cut to its tiny horizon, these are whole.
     assert -1.0 <= float(by_target["Task"][1]) <= 1.0 and np.isfinite(found)
     assert {"Task", "Strategy 1", "Strategy 2"} <= set(by_target)
@@ -234,7 +142,7 @@ def test_reward_of_an_unfinished_run_is_an_error(tmp_path):
     ],
 )
 def test_bad_usage_is_one_line(tmp_path, flag, message):
-    process = _launch(tmp_path / "bad", flag)
+    process = launch(tmp_path / "bad", flag)
     output, _ = process.communicate(timeout=120)
     assert process.returncode in (1, 2)
     assert message in output and "Traceback" not in output

@@ -16,8 +16,7 @@ SIZES = ("regression:8", "regression:9")
 
 
 def _start(out, *arguments, devices=1):
-    flags = "--xla_backend_optimization_level=0"
-    flags += f" --xla_force_host_platform_device_count={devices}"
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
     out.mkdir(exist_ok=True)
     return subprocess.Popen(
         [sys.executable, SCRIPT, out, *arguments],
@@ -97,8 +96,7 @@ def _launch(out, *flags):
     return subprocess.Popen(
         [*command, "--env=inverted_double_pendulum", f"--out={out}", *flags],
         cwd=ROOT,
-        env=os.environ
-        | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_backend_optimization_level=0"},
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -34,15 +34,6 @@ CONFIG = msrd.MsrdConfig(
 ALPHA = 0.7
 SHOWN_ACTIONS = (0.5, -0.5)
 
-# Nearly all the time of these tests is XLA's, which need not optimise what runs once.
-_jit = functools.partial(
-    jax.jit,
-    compiler_options={
-        "xla_backend_optimization_level": 0,
-        "xla_llvm_disable_expensive_passes": True,
-    },
-)
-
 
 def _transition(rng, shape, obs_dim=2):
     return Transition(
@@ -66,7 +57,7 @@ def _state(hidden_sizes=(8,)):
     config = dataclasses.replace(CONFIG, hidden_sizes=hidden_sizes)
     shown = _transition(np.random.default_rng(1), (2, 64))
     shown = shown._replace(obs_t=2.0 * shown.obs_t + 1.0)
-    return _jit(lambda key: msrd.init_rewards(key, shown, config))(jax.random.PRNGKey(10))
+    return jax.jit(lambda key: msrd.init_rewards(key, shown, config))(jax.random.PRNGKey(10))
 
 
 def _member(stacked, i):
@@ -101,7 +92,8 @@ def test_without_demonstrated_actions_log_pi_is_left_out_of_both_halves():
     zero = np.zeros((2, 2, 16), np.float32)
     zeros = rows._replace(log_prob_expert=zero, log_prob_policy=zero)
     state = _state()
-    update = _jit(lambda rows: msrd.update_rewards(state, rows, jax.random.PRNGKey(3), CONFIG)[0])
+    key = jax.random.PRNGKey(3)
+    update = jax.jit(lambda rows: msrd.update_rewards(state, rows, key, CONFIG)[0])
     _assert_close(update(states), update(zeros))
 
 
@@ -113,7 +105,7 @@ def test_loss_in_closed_form(hidden_sizes, penalty):
     )
     own = _of_strategy(_state(hidden_sizes).rewards, 1)
     rows = _rows((16,))
-    loss = _jit(lambda own, rows: msrd.loss(own, rows, jax.random.PRNGKey(3), config))
+    loss = jax.jit(lambda own, rows: msrd.loss(own, rows, jax.random.PRNGKey(3), config))
     found, metrics = loss(own, rows)
 
     f, task, strategy = [], [], []
@@ -142,10 +134,10 @@ def test_loss_in_closed_form(hidden_sizes, penalty):
 def test_task_reward_makes_one_step_along_the_gradients_of_all_strategies_and_updates():
     config = dataclasses.replace(CONFIG, learning_rate=0.05, updates_per_step=3)
     state, rows, key = _state(), _rows((2, 3, 8)), jax.random.PRNGKey(4)
-    found, _ = _jit(lambda *args: msrd.update_rewards(*args, config))(state, rows, key)
+    found, _ = jax.jit(lambda *args: msrd.update_rewards(*args, config))(state, rows, key)
     _, task_optimizer, optimizer = msrd._networks(config)
 
-    @_jit
+    @jax.jit
     def update(own, opt, batch, key):
         grads = jax.grad(lambda own: msrd.loss(own, batch, key, config)[0])(own)
         nets = (own.strategies, own.shaping)
@@ -157,7 +149,7 @@ def test_task_reward_makes_one_step_along_the_gradients_of_all_strategies_and_up
     task_grads = []
     for i in range(2):
         own = _of_strategy(state.rewards, i)
-        opt = _jit(optimizer.init)((own.strategies, own.shaping))
+        opt = jax.jit(optimizer.init)((own.strategies, own.shaping))
         for j in range(3):
             batch = jax.tree.map(lambda x, i=i, j=j: x[i, j], rows)
             own, opt, grads = update(own, opt, batch, keys[j, i])
@@ -167,7 +159,7 @@ def test_task_reward_makes_one_step_along_the_gradients_of_all_strategies_and_up
     # Adam's first moment is a tenth of the gradient of its first step.
     _assert_close(found.task_opt[0].mu, jax.tree.map(lambda grad: 0.1 * grad, total))
     assert int(found.task_opt[0].count) == 1
-    updates, _ = _jit(task_optimizer.update)(total, state.task_opt, state.rewards.task)
+    updates, _ = jax.jit(task_optimizer.update)(total, state.task_opt, state.rewards.task)
     _assert_close(found.rewards.task, jax.tree.map(jnp.add, state.rewards.task, updates))
 
 
@@ -230,7 +222,7 @@ def test_reward_is_task_plus_weighted_strategy_of_the_next_state():
 def test_update_is_the_same_without_jit():
     config = dataclasses.replace(CONFIG, hidden_sizes=(), gradient_penalty=0.0)
     state, rows, key = _state(()), _rows((2, 2, 8)), jax.random.PRNGKey(5)
-    compiled, _ = _jit(lambda *args: msrd.update_rewards(*args, config))(state, rows, key)
+    compiled, _ = jax.jit(lambda *args: msrd.update_rewards(*args, config))(state, rows, key)
     with jax.disable_jit():
         plain, _ = msrd.update_rewards(state, rows, key, config)
     _assert_close(plain, compiled)
@@ -253,7 +245,7 @@ def demonstrations(problem):
 
 @pytest.fixture(scope="module")
 def started(problem, demonstrations):
-    init = _jit(lambda key: msrd.init(key, problem.env, demonstrations, CONFIG))
+    init = jax.jit(lambda key: msrd.init(key, problem.env, demonstrations, CONFIG))
     return init(jax.random.PRNGKey(0))
 
 
@@ -271,7 +263,7 @@ def test_training_counts_its_steps_bounds_rewards_and_hands_on_averages(
     problem, demonstrations, started
 ):
     config = dataclasses.replace(CONFIG, reward_scale=2.0, reward_clip=1e-3)
-    train = _jit(lambda state: msrd.train(state, problem.env, demonstrations, config, 2))
+    train = jax.jit(lambda state: msrd.train(state, problem.env, demonstrations, config, 2))
     # Far apart, so that the bounded reward of a generator tells whose it is.
     rewards = started.learned.rewards
     last_layer = rewards.strategies["params"]["hidden_1"]

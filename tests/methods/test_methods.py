@@ -1,0 +1,73 @@
+"""Every method from demonstrations to what it returns, with tiny budgets."""
+
+import json
+
+import numpy as np
+import pytest
+from launcher import finish, launch, log_of, results_of
+
+import represent_jax as rj
+from represent_jax.errors import RepresentError, UsageError
+
+
+def test_represent_in_pure_xla(tmp_path):
+    """From demonstrations to a policy on MJX; the pendulum's physics compile soonest."""
+    flags = ("--env=inverted_double_pendulum", "--backend=mjx")
+    finish(launch(tmp_path / "xla", *flags, "--override=policy_targets=strategy_1"))
+    results = results_of(tmp_path / "xla")
+    assert set(results["rewards"]) == {"task", "strategy_1", "strategy_2"}
+    assert np.isfinite(results["policies"]["strategy_1"]["return_final"])
+    stages = {line["stage"] for line in log_of(tmp_path / "xla")}
+    assert stages == {"airl", "regression", "policies", "clock"}
+
+
+def test_ssrr_on_one_strategy_with_ppo_throughout(tmp_path):
+    out, record = tmp_path / "alone", tmp_path / "records.jsonl"
+    overrides = ("grouping=strategy_2", "airl.agent=ppo", "policies.agent=ppo")
+    flags = [f"--override={one}" for one in overrides]
+    finish(launch(out, "--method=ssrr", "--backend=mujoco", f"--record={record}", *flags))
+    assert set(results_of(out)["policies"]) == {"strategy_2"}
+    lines = [json.loads(line) for line in record.read_text().splitlines()]
+    assert {line["method"] for line in lines} == {"ssrr"}
+    assert {line["target"] for line in lines} == {"strategy_2"}
+    obs, action = np.zeros((3, 17), np.float32), np.zeros((3, 6), np.float32)
+    assert rj.load_reward(out)(obs, action, obs, "strategy_2").shape == (3,)
+    assert rj.load_policy(out, "strategy_2")(obs).shape == (3, 6)
+
+
+def test_a_policy_for_some_of_the_targets(tmp_path):
+    out = tmp_path / "task_only"
+    overrides = ("policy_targets=task", "num_strategies=1")
+    flags = [f"--override={one}" for one in overrides]
+    finish(launch(out, "--backend=mujoco", "--env=inverted_double_pendulum", *flags))
+    results = results_of(out)
+    assert set(results["rewards"]) == {"task", "strategy_1"}
+    assert set(results["policies"]) == {"task"}
+    obs = np.zeros((3, 11), np.float32)
+    assert rj.load_policy(out)(obs).shape == (3, 1)
+    with pytest.raises(UsageError, match="task"):
+        rj.load_policy(out, "strategy_1")
+
+
+@pytest.mark.parametrize("method", ["drex", "msrd", "bc", "bc_rnn"])
+def test_baselines_run_to_their_end(tmp_path, method):
+    record = tmp_path / "records.jsonl"
+    out = tmp_path / method
+    finish(launch(out, f"--method={method}", "--backend=mujoco", f"--record={record}"))
+    results = results_of(out)
+    finals = [policy["return_final"] for policy in results["policies"].values()]
+    assert finals and np.isfinite(finals).all()
+    lines = [json.loads(line) for line in record.read_text().splitlines()]
+    assert {line["method"] for line in lines} == {method}
+    obs, action = np.zeros((3, 17), np.float32), np.zeros((3, 6), np.float32)
+    if method in ("drex", "msrd"):
+        assert rj.load_reward(out)(obs, action, obs).shape == (3,)
+    else:
+        with pytest.raises(RepresentError, match="no reward"):
+            rj.load_reward(out)
+    if method == "bc_rnn":
+        with pytest.raises(RepresentError, match="hidden state"):
+            rj.load_policy(out)
+    else:
+        target = next(iter(results["policies"]))
+        assert rj.load_policy(out, target)(obs).shape == (3, 6)
