@@ -1,6 +1,7 @@
 """Makes the demonstrations and test trajectories that ship with the package, or a robot's own.
 
 python -m experiments.make_demonstrations --env=half_cheetah --out=represent_jax/data/shipped
+python -m experiments.make_demonstrations --env=half_cheetah_8 --out=represent_jax/data/shipped
 python -m experiments.make_demonstrations --env=franka_kitchen --override push.fast_share=0.3
 python -m experiments.make_demonstrations --env=my_robots:Swimmer --out=data \
     --override diayn.num_skills=2 --override target_returns=20,30
@@ -18,30 +19,37 @@ from represent_jax import config as configs
 from represent_jax.data.npz import save_demonstrations
 from represent_jax.data.trajectories import Demonstrations, Trajectory
 from represent_jax.envs import Environment, make_env
+from represent_jax.errors import UsageError
 from represent_jax.methods import demonstrators, operators
 from represent_jax.stages import style
 
-_ENV = flags.DEFINE_string("env", "half_cheetah", "Environment whose demonstrators to make.")
+_ENV = flags.DEFINE_string(
+    "env",
+    "half_cheetah",
+    "Environment whose demonstrators to make, or half_cheetah_8: eight strategies, no test set.",
+)
 _OUT = flags.DEFINE_string("out", "represent_jax/data/shipped", "Folder to write to.")
 _PART = flags.DEFINE_enum("part", "both", ["both", "demonstrations", "test"], "What to make.")
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting as dotted.key=value; repeatable.")
 _BACKEND = flags.DEFINE_string("backend", "auto", "Physics engine: auto, mujoco or mjx.")
 
-_OPERATORS = operators.OperatorsConfig()
-
 
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
-    known = {**demonstrators.DEMONSTRATORS, _OPERATORS.env: _OPERATORS}
+    known = demonstrators.DEMONSTRATORS | operators.OPERATORS
     config = known.get(_ENV.value) or _robots_own(_ENV.value)
     config = configs.apply_overrides(config, _OVERRIDE.value)
     out = Path(_OUT.value)
     os.makedirs(out, exist_ok=True)
     driven = isinstance(config, operators.OperatorsConfig)
+    # Of shipped demonstrations, some are a domain's second set.
+    name = _ENV.value if _ENV.value in known else config.env
+    if _PART.value == "test" and name != config.env:
+        raise UsageError(f"part: {name} has no test set of its own, but that of {config.env}")
     if _PART.value in ("both", "demonstrations"):
         make = _drive_demonstrations if driven else _make_demonstrations
-        make(config, out / f"{config.env}.npz")
-    if _PART.value in ("both", "test"):
+        make(config, out / f"{name}.npz")
+    if _PART.value in ("both", "test") and name == config.env:
         make = _drive_test_set if driven else _make_test_set
         make(config, out / f"{config.env}_test.npz")
 

@@ -8,6 +8,7 @@ from represent_jax.data.trajectories import (
     pad,
     returns,
     unpad,
+    without_pauses,
 )
 
 __all__ = [
@@ -19,4 +20,5 @@ __all__ = [
     "returns",
     "save_demonstrations",
     "unpad",
+    "without_pauses",
 ]

@@ -266,6 +266,35 @@ def _stack_padded(rows: list[np.ndarray | None], missing: list[int]) -> np.ndarr
     return np.stack([np.pad(x, ((0, m),) + ((0, 0),) * (x.ndim - 1)) for x, m in padded])
 
 
+def without_pauses(trajectory: Trajectory, least_change: float) -> Trajectory:
+    """Leaves out the steps in which nothing moves: of those a policy without memory learns to rest.
+
+    Args:
+        trajectory: one episode.
+        least_change: change of the entry of the observation that changes most, below which a step
+            is a pause; with 0 nothing is left out.
+
+    Raises:
+        RepresentError: all of it is a pause.
+    """
+    moves = np.abs(np.diff(trajectory.obs, axis=0)).max(axis=1) >= least_change
+    if moves.all():
+        return trajectory
+    if not moves.any():
+        raise RepresentError(
+            f"a trajectory of strategy {trajectory.strategy} never moves: no observation changes "
+            f"by {least_change:g} in a step"
+        )
+    last = 1 + np.flatnonzero(moves)[-1]
+    return Trajectory(
+        obs=np.concatenate([trajectory.obs[:-1][moves], trajectory.obs[last : last + 1]]),
+        actions=None if trajectory.actions is None else trajectory.actions[moves],
+        rewards=None if trajectory.rewards is None else trajectory.rewards[moves],
+        terminated=trajectory.terminated and bool(moves[-1]),
+        strategy=trajectory.strategy,
+    )
+
+
 def unpad(batch: TrajectoryBatch) -> tuple[Trajectory, ...]:
     """Returns the trajectories of a batch; those that stop before the horizon as terminated."""
     obs, actions, rewards, mask, strategy, _ = (

@@ -7,7 +7,7 @@ from brax.envs import base
 
 from represent_jax.envs import playground
 from represent_jax.envs.environment import Environment
-from represent_jax.envs.franka_kitchen import FrankaKitchen
+from represent_jax.envs.franka_kitchen import FrankaKitchen, FrankaKitchenHand
 from represent_jax.envs.half_cheetah import HalfCheetah
 from represent_jax.envs.hopper import Hopper
 from represent_jax.envs.inverted_double_pendulum import InvertedDoublePendulum
@@ -16,7 +16,8 @@ from represent_jax.errors import UsageError, unknown
 from represent_jax.physics import make_engine, resolve_backend
 
 _TASKS: dict[str, Callable[..., Task]] = {
-    task.name: task for task in (Hopper, HalfCheetah, InvertedDoublePendulum, FrankaKitchen)
+    task.name: task
+    for task in (Hopper, HalfCheetah, InvertedDoublePendulum, FrankaKitchen, FrankaKitchenHand)
 }
 
 

@@ -117,7 +117,7 @@ def train_bc(
 ) -> Params:
     """Behavioural cloning of all demonstrations together."""
     key_split, key = jax.random.split(key)
-    every = pipeline.transitions(problem.demonstrations.trajectories)
+    every = pipeline.transitions(problem.lessons.trajectories)
     data = bc.split(key_split, every, config)
     return pipeline.run_updates(
         "bc",

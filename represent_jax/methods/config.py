@@ -4,7 +4,7 @@ import dataclasses
 from typing import NamedTuple
 
 from represent_jax.config import require
-from represent_jax.data.trajectories import Demonstrations, Trajectory
+from represent_jax.data.trajectories import Demonstrations, Trajectory, without_pauses
 from represent_jax.envs import Environment, Episode
 from represent_jax.errors import RepresentError, UsageError, unknown
 from represent_jax.stages import airl, policies
@@ -32,6 +32,8 @@ class MethodConfig:
       test: name or file of unseen trajectories, on which rewards are judged; the environment's own
         if empty, none where none ship.
       horizon: environment steps of an episode; 0 is the environment's own.
+      least_change: of the entry of a demonstrated observation that changes most in a step; in less
+        the demonstrator pauses, and methods do not learn from it. 0 keeps every step.
       population: how members run together, see `methods.population`.
     """
 
@@ -45,6 +47,7 @@ class MethodConfig:
     demonstrations: str = ""
     test: str = ""
     horizon: int = 0
+    least_change: float = 0.0
     population: str = "auto"
 
     def __post_init__(self) -> None:
@@ -58,6 +61,7 @@ class MethodConfig:
         )
         require(self.seed >= 0, "seed", "at least 0", self.seed)
         require(self.horizon >= 0, "horizon", "at least 0", self.horizon)
+        require(self.least_change >= 0.0, "least_change", "at least 0", self.least_change)
 
     @property
     def num_groups(self) -> int:
@@ -162,11 +166,13 @@ class Problem(NamedTuple):
     Attributes:
       env: episodes that reset themselves.
       demonstrations: of the strategies in use.
+      lessons: these without their pauses, which is what methods learn from.
       test: unseen trajectories, with true rewards; only evaluation looks at them. May be none.
     """
 
     env: Episode
     demonstrations: Demonstrations
+    lessons: Demonstrations
     test: tuple[Trajectory, ...]
 
 
@@ -204,9 +210,12 @@ def make_problem(
             for t in own
             if config.grouping in ("merged", names[t.strategy])
         ]
+    own = [_truncate(t, horizon) for t in own]
+    moving = [without_pauses(t, config.least_change) for t in own]
     return Problem(
         Episode(env, horizon),
-        dataclasses.replace(demonstrations, trajectories=tuple(_truncate(t, horizon) for t in own)),
+        dataclasses.replace(demonstrations, trajectories=tuple(own)),
+        dataclasses.replace(demonstrations, trajectories=tuple(moving)),
         tuple(_truncate(t, horizon) for t in test.trajectories) if test is not None else (),
     )
 

@@ -89,7 +89,7 @@ def train(
     checkpoint_seconds: float,
 ) -> msrd.MsrdOutput:
     """MSRD's joint training of all strategies."""
-    demonstrations = stack(pipeline.transitions_of(problem.demonstrations))
+    demonstrations = stack(pipeline.transitions_of(problem.lessons))
 
     def init(key):
         return msrd.init(key, problem.env, demonstrations, config)

@@ -107,6 +107,9 @@ class OperatorsConfig:
         )
 
 
+OPERATORS = {name: OperatorsConfig(env=name) for name in ("franka_kitchen", "franka_kitchen_hand")}
+
+
 class View(NamedTuple):
     """What an operator sees; positions in m, in the axes of the kitchen.
 

@@ -32,7 +32,7 @@ def run_airl(
     checkpoint_seconds: float,
 ) -> airl.AirlOutput:
     """Phase 1 for all strategies; leaves of the result are `[num_strategies, ...]`."""
-    members = transitions_of(problem.demonstrations)
+    members = transitions_of(problem.lessons)
     population = Population(members, config.population, airl.population_axes)
 
     def init(key, demonstrations):
@@ -301,7 +301,7 @@ def run_updates(
 
 def padded_demonstrations(problem: Problem) -> TrajectoryBatch:
     """Demonstrations `[num_strategies, num_demonstrations]`, repeated to one common number."""
-    demonstrations = problem.demonstrations
+    demonstrations = problem.lessons
     groups = [demonstrations.of_strategy(i) for i in range(demonstrations.num_strategies)]
     most = max(len(group) for group in groups)
     padded = [

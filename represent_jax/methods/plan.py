@@ -130,7 +130,7 @@ def nodes(
         "backend": problem.env.backend,
         "horizon": problem.env.horizon,
         "seed": config.seed,
-        "demonstrations": _digest(problem.demonstrations.trajectories),
+        "demonstrations": _digest(problem.lessons.trajectories),
     }
     judged = common | {"test": _digest(problem.test)}
     made: dict[str, Node] = {}

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -117,3 +119,25 @@ def test_pad_refuses_what_does_not_fit():
         data.pad((trajectory(7),), horizon=5)
     with pytest.raises(RepresentError, match="no trajectories"):
         data.pad((), horizon=5)
+
+
+def paused(obs, terminated=False):
+    obs = np.asarray(obs, np.float32)[:, None]
+    steps = np.arange(len(obs) - 1, dtype=np.float32)
+    return data.Trajectory(obs, steps[:, None] / 10, steps, terminated, 0)
+
+
+def test_without_pauses_keeps_the_steps_that_move():
+    moving = data.without_pauses(paused([0.0, 0.0, 1.0, 1.05, 2.0, 2.0], terminated=True), 0.1)
+    np.testing.assert_allclose(moving.obs[:, 0], [0.0, 1.05, 2.0])
+    np.testing.assert_allclose(moving.rewards, [1.0, 3.0])
+    np.testing.assert_allclose(moving.actions[:, 0], [0.1, 0.3])
+    assert not moving.terminated
+
+
+def test_without_pauses_takes_states_alone_and_keeps_all_where_asked():
+    one = dataclasses.replace(paused([0.0, 0.0, 1.0]), actions=None, rewards=None)
+    assert data.without_pauses(one, 0.1).length == 1
+    assert data.without_pauses(one, 0.0) is one
+    with pytest.raises(RepresentError, match="never moves"):
+        data.without_pauses(one, 5.0)

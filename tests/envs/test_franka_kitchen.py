@@ -18,8 +18,8 @@ from brax.envs import base
 
 import represent_jax as rj
 from represent_jax.envs import Episode, make_env
-from represent_jax.envs.franka_kitchen import FrankaKitchen, scene
-from represent_jax.envs.franka_kitchen.task import KETTLE_GOAL, OBSERVATION_NOISE
+from represent_jax.envs.franka_kitchen import FrankaKitchen, arm, scene
+from represent_jax.envs.franka_kitchen.task import ARM_START, KETTLE_GOAL, OBSERVATION_NOISE
 from represent_jax.errors import RepresentError
 from represent_jax.physics import PhysicsState
 
@@ -41,8 +41,8 @@ def make_source():
 
 
 @functools.cache
-def make_kitchen(noisy=False):
-    return make_env("franka_kitchen", "mujoco", noisy=noisy)
+def make_kitchen(noisy=False, name="franka_kitchen"):
+    return make_env(name, "mujoco", noisy=noisy)
 
 
 @functools.cache
@@ -177,11 +177,12 @@ def test_the_driver_reads_how_far_the_kettle_is_from_its_goal():
     assert distance == pytest.approx(np.linalg.norm(state.obs[32:35] - KETTLE_GOAL), abs=1e-6)
 
 
+@pytest.mark.parametrize("name", ["franka_kitchen", "franka_kitchen_hand"])
 @pytest.mark.parametrize(
     ("keys", "axis", "sign"), [("w", 1, 1), ("s", 1, -1), ("a", 0, -1), ("d", 0, 1), ("q", 2, 1)]
 )
-def test_keys_move_the_hand_and_only_that_way(keys, axis, sign):
-    env = make_kitchen()
+def test_keys_move_the_hand_and_only_that_way(keys, axis, sign, name):
+    env = make_kitchen(name=name)
     model = env.engine.model
     keyboard, data = env.task.keyboard(model), mujoco.MjData(model)
     step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(0))
@@ -199,8 +200,9 @@ def test_keys_move_the_hand_and_only_that_way(keys, axis, sign):
     assert np.abs(np.delete(moved, axis)).max() < 0.02
 
 
-def test_the_hand_stays_where_it_is_and_the_fingers_where_they_were_told():
-    env = make_kitchen()
+@pytest.mark.parametrize("name", ["franka_kitchen", "franka_kitchen_hand"])
+def test_the_hand_stays_where_it_is_and_the_fingers_where_they_were_told(name):
+    env = make_kitchen(name=name)
     keyboard = env.task.keyboard(env.engine.model)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     physics = state.pipeline_state
@@ -210,8 +212,57 @@ def test_the_hand_stays_where_it_is_and_the_fingers_where_they_were_told():
     step = jax.jit(env.step)
     for _ in range(20):
         state = step(state, keyboard.action(frozenset(), state.pipeline_state))
-    assert np.abs(state.obs[:7] - physics.qpos[:7]).max() < 0.02
+    assert np.abs(state.obs[:7] - physics.qpos[:7]).max() < 0.03
     assert isinstance(physics, PhysicsState)
+
+
+def test_kinematics_of_the_arm_are_mujocos():
+    model = scene.load_full()
+    data, described = mujoco.MjData(model), arm.read_arm(model)
+    site, jacobian = model.site("end_effector").id, np.zeros((6, model.nv))
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        joints = ARM_START[:7] + rng.normal(0.0, 0.3, 7)
+        data.qpos[:7] = joints
+        mujoco.mj_forward(model, data)
+        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], site)
+        found = jax.jit(arm.locate_hand)(described, jnp.asarray(joints))
+        np.testing.assert_allclose(found.position, data.site_xpos[site], atol=1e-5)
+        np.testing.assert_allclose(found.rotation, data.site_xmat[site].reshape(3, 3), atol=1e-5)
+        np.testing.assert_allclose(found.jacobian, jacobian[:, :7], atol=1e-5)
+        np.testing.assert_allclose(found.weight, data.qfrc_bias[:7], atol=0.02)
+
+
+def test_turns_between_rotations():
+    angle, half = 0.8, np.sin(0.4)
+    about_z = np.array([[np.cos(0.8), -np.sin(0.8), 0], [np.sin(0.8), np.cos(0.8), 0], [0, 0, 1]])
+    turn = arm.turn_between(jnp.eye(3), jnp.asarray(about_z))
+    np.testing.assert_allclose(turn, [0.0, 0.0, 2.0 * half], atol=1e-6)
+    np.testing.assert_allclose(arm.turn_between(about_z, about_z), 0.0, atol=1e-6)
+    assert abs(float(jnp.linalg.norm(turn)) - angle) < 0.03
+
+
+def test_an_action_of_the_hand_rolls_it_and_leaves_it_in_place():
+    env = make_kitchen(name="franka_kitchen_hand")
+    assert env.action_size == 5 and env.observation_size == 59
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(0))
+    described = arm.read_arm(env.engine.model)
+    before = arm.locate_hand(described, state.obs[:7])
+    for _ in range(40):
+        state = step(state, jnp.array([0.0, 0.0, 0.0, -0.5, 1.0]))
+    after = arm.locate_hand(described, state.obs[:7])
+    np.testing.assert_allclose(after.position, before.position, atol=0.005)
+    turn = arm.turn_between(before.rotation, after.rotation)
+    np.testing.assert_allclose(turn, [0.0, -2.0 * np.sin(np.pi / 8), 0.0], atol=0.03)
+
+
+def test_keys_of_the_hand_hold_their_roll_and_know_the_slow_key():
+    keyboard = make_kitchen(name="franka_kitchen_hand").task.keyboard(None)
+    rolled = [keyboard.action(frozenset("z"), None)[3] for _ in range(50)]
+    assert rolled[0] == pytest.approx(-0.6 * 0.08 / (0.5 * np.pi)) and rolled[-1] == -1.0
+    np.testing.assert_allclose(
+        keyboard.action(frozenset({"w", "d", "shift"}), None), [0.25, 0.25, 0.0, -1.0, 1.0]
+    )
 
 
 def test_missing_assets_are_named(monkeypatch):

@@ -126,7 +126,8 @@ def test_names_are_known():
     with pytest.raises(UsageError, match=r"unknown environment 'half_cheeta'.*half_cheetah"):
         make_env("half_cheeta")
     with pytest.raises(
-        UsageError, match=r"unknown environment 'ant'.*known are franka_kitchen, half_cheetah"
+        UsageError,
+        match=r"unknown environment 'ant'.*known are franka_kitchen, franka_kitchen_hand",
     ):
         make_env("ant")
     with pytest.raises(UsageError, match="unknown backend 'mjy'"):

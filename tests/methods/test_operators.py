@@ -9,7 +9,14 @@ import pytest
 import represent_jax as rj
 from represent_jax.envs import make_env
 from represent_jax.errors import UsageError
-from represent_jax.methods.operators import Driver, Operator, OperatorsConfig, View, keys_of
+from represent_jax.methods.operators import (
+    OPERATORS,
+    Driver,
+    Operator,
+    OperatorsConfig,
+    View,
+    keys_of,
+)
 
 START = View(np.array([-0.43, 0.12, 2.02]), np.array([-0.27, 0.35, 1.62]), 0.0)
 EXACT = Operator(aim_error=0.0, pause_rate=0.0, think_steps=0.0, fast_share=0.0)
@@ -39,8 +46,9 @@ def test_an_operator_thinks_pauses_and_differs_by_seed():
 @pytest.mark.skipif(
     importlib.util.find_spec("gymnasium_robotics") is None, reason="needs the extra 'kitchen'"
 )
-def test_an_operator_pushes_the_kettle_through_the_keys():
-    env = make_env("franka_kitchen", "mujoco")
+@pytest.mark.parametrize("name", sorted(OPERATORS))
+def test_an_operator_pushes_the_kettle_through_the_keys(name):
+    env = make_env(name, "mujoco")
     env.task.horizon = 150
     trajectory = Driver(env).episode(EXACT, seed=0)
     assert trajectory.length == 150
@@ -54,14 +62,15 @@ def test_unknown_strategies_are_errors():
         Operator(strategy="pull")
 
 
-def test_what_ships_is_at_the_papers_level_and_says_who_made_it():
-    demonstrations = rj.load_demonstrations("franka_kitchen")
+@pytest.mark.parametrize(("name", "successes"), [("franka_kitchen", 5), ("franka_kitchen_hand", 1)])
+def test_what_ships_is_at_the_papers_level_and_says_who_made_it(name, successes):
+    demonstrations = rj.load_demonstrations(name)
     for strategy, target in enumerate(OperatorsConfig().target_returns):
         assert abs(demonstrations.mean_return(strategy) / target - 1.0) < 0.05
     assert demonstrations.metadata["style_accuracy"]["1-2"]["trajectories"] >= 0.95
-    assert np.mean(demonstrations.metadata["outcomes"]["success"][:5]) == 1.0
-    test = rj.load_demonstrations("franka_kitchen_test")
+    assert np.sum(demonstrations.metadata["outcomes"]["success"][:5]) >= successes
+    test = rj.load_demonstrations(f"{name}_test")
     returns = np.array([t.total_reward for t in test.trajectories])
-    assert len(returns) == 50 and returns.min() < -200.0 and returns.max() > -80.0
+    assert len(returns) == 50 and returns.min() < -200.0 and returns.max() > -85.0
     for data in (demonstrations, test):
         assert "scripted operators" in data.metadata["source"]

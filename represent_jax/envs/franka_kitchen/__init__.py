@@ -1,5 +1,6 @@
 """Franka Kitchen: an arm moves a kettle from one burner to another."""
 
+from represent_jax.envs.franka_kitchen.hand import FrankaKitchenHand
 from represent_jax.envs.franka_kitchen.task import FrankaKitchen
 
-__all__ = ["FrankaKitchen"]
+__all__ = ["FrankaKitchen", "FrankaKitchenHand"]
