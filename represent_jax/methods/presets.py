@@ -92,6 +92,13 @@ _KITCHEN = (
     "airl.cloning_updates=5_000",
     *_GENTLE_PHASE_1,
     "policies.sac.prior_weight=0.05",
+    # At the prior's weight entropy and prior are one term, weight * KL(pi || prior). Learned, the
+    # temperature rises to 300: what moves a kettle has far less entropy than SAC aims at.
+    *(
+        f"{stage}.sac.{setting}"
+        for stage in ("airl", "policies")
+        for setting in ("learn_temperature=false", "initial_temperature=0.05")
+    ),
 )
 
 # What a domain needs beside a preset of full size, as overrides for the methods that have them.
