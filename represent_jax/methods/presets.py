@@ -82,21 +82,26 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
-# Phase 1 from a clone: critics that know nothing undo it within 20,000 steps (Hopper from .85 and
-# .49 a step to 0, the kitchen's kettle is never touched again), so they learn first, and SAC stays
-# near the clone.
-_GENTLE_PHASE_1 = ("airl.sac.critic_warmup_updates=2_000", "airl.sac.prior_weight=0.05")
+# A generator that starts from a clone, with critics that know nothing, undoes it in 20,000 steps
+# (Hopper from .85 and .49 a step to 0, the kitchen's kettle is never touched again). So critics
+# learn first, and SAC stays near the clone; MSRD's generators are of the same kind.
+_GENERATORS = ("airl", "msrd")
+_GENTLE_IMITATION = tuple(
+    f"{stage}.sac.{setting}"
+    for stage in _GENERATORS
+    for setting in ("critic_warmup_updates=2_000", "prior_weight=0.05")
+)
 _KITCHEN = (
     # The operators stop to think; longer cloning fits each of five demonstrations by heart.
     "least_change=0.002",
-    "airl.cloning_updates=5_000",
-    *_GENTLE_PHASE_1,
+    *(f"{stage}.cloning_updates=5_000" for stage in _GENERATORS),
+    *_GENTLE_IMITATION,
     "policies.sac.prior_weight=0.05",
     # At the prior's weight entropy and prior are one term, weight * KL(pi || prior). Learned, the
     # temperature rises to 300: what moves a kettle has far less entropy than SAC aims at.
     *(
         f"{stage}.sac.{setting}"
-        for stage in ("airl", "policies")
+        for stage in (*_GENERATORS, "policies")
         for setting in ("learn_temperature=false", "initial_temperature=0.05")
     ),
 )
@@ -113,7 +118,7 @@ DOMAINS: dict[str, tuple[str, ...]] = {
         # SSRR's levels for this domain, up to 0.8: at 0.95 a hopper lies as it never did at the
         # levels below, and that one level sets the lower end of the curve's scale.
         "noise.num_levels=17",
-        *_GENTLE_PHASE_1,
+        *_GENTLE_IMITATION,
         "policies.sac.prior_weight=0.05",
     ),
 }
