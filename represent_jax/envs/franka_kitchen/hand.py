@@ -12,8 +12,14 @@ from represent_jax.envs.franka_kitchen import scene
 from represent_jax.envs.franka_kitchen.arm import NUM_ARM, Arm
 from represent_jax.envs.franka_kitchen.keyboard import (
     ANGULAR_SPEED,
+    DAMPING,
     LINEAR_SPEED,
+    MIDDLE_WEIGHT,
     SLOW,
+    TO_MIDDLE,
+    TURN_BACK,
+    TURN_WEIGHT,
+    Fingers,
 )
 from represent_jax.envs.franka_kitchen.task import ARM_START, TARGET_BOUNDS, FrankaKitchen
 from represent_jax.envs.keyboard import Keyboard
@@ -21,10 +27,6 @@ from represent_jax.physics.engine import PhysicsState
 
 # What a roll of 1 is, in rad; beyond it the wrist comes near its limit.
 ROLL = 0.5 * np.pi
-# Rates at which the hand returns to how it should be turned and a joint to its middle, per second.
-_TURN_BACK, _TO_MIDDLE = 2.0, 0.3
-# What least squares give up first, see `KitchenKeyboard`.
-_TURN_WEIGHT, _DAMPING, _MIDDLE_WEIGHT = 0.15, 0.02, 0.01
 # Within this of its limit, in rad, a joint is held back the more the nearer it is.
 _MARGIN = 0.1
 _PASSES = 3
@@ -62,8 +64,8 @@ class FrankaKitchenHand(FrankaKitchen):
         arm, action_t = _arm(), jnp.clip(action_t, -1.0, 1.0)
         hand = kinematics.locate_hand(arm, obs_t[:NUM_ARM])
         turn = kinematics.turn_between(hand.rotation, _rolled(ROLL * action_t[3]) @ _start())
-        speed = jnp.linalg.norm(turn)
-        turn = turn * _TURN_BACK * jnp.minimum(1.0, ANGULAR_SPEED / (_TURN_BACK * speed + 1e-6))
+        turn = turn * TURN_BACK
+        turn = turn * jnp.minimum(1.0, ANGULAR_SPEED / (jnp.linalg.norm(turn) + 1e-6))
         velocity = jnp.concatenate([LINEAR_SPEED * action_t[:3], turn])
         speeds = _joint_speeds(arm, hand.jacobian, obs_t[:NUM_ARM], velocity)
         # The law's unit is 2 rad/s, and a joint goes but a share of the way to its target.
@@ -88,13 +90,10 @@ class HandKeyboard(Keyboard):
         self.reset()
 
     def reset(self) -> None:
-        self._roll, self._closing, self._space_was_held = 0.0, False, False
+        self._roll, self._fingers = 0.0, Fingers()
 
     def action(self, held: frozenset[str], physics: PhysicsState) -> np.ndarray:
         del physics
-        if " " in held and not self._space_was_held:
-            self._closing = not self._closing
-        self._space_was_held = " " in held
         action = np.zeros(5, np.float32)
         for key in held & _MOVES.keys():
             _, entry, sign = _MOVES[key]
@@ -102,7 +101,7 @@ class HandKeyboard(Keyboard):
         action *= SLOW if "shift" in held else 1.0
         self._roll += action[3] * ANGULAR_SPEED * kinematics.STEP / ROLL
         self._roll = float(np.clip(self._roll, -1.0, 1.0))
-        action[3], action[4] = self._roll, -1.0 if self._closing else 1.0
+        action[3], action[4] = self._roll, self._fingers.action(held)
         return action
 
 
@@ -132,14 +131,14 @@ def _joint_speeds(
     arm: Arm, jacobian: jax.Array, joints: jax.Array, velocity: jax.Array
 ) -> jax.Array:
     """Speeds of the arm's joints that give the hand a velocity, `[7]`."""
-    weights = jnp.repeat(jnp.array([1.0, _TURN_WEIGHT]), 3)
-    middle = _TO_MIDDLE * (0.5 * (arm.low + arm.high) - joints)
+    weights = jnp.repeat(jnp.array([1.0, TURN_WEIGHT]), 3)
+    middle = TO_MIDDLE * (0.5 * (arm.low + arm.high) - joints)
     free = jnp.ones(NUM_ARM)
     for _ in range(_PASSES):
         # Joints held back leave their part to the others.
         rows = weights[:, None] * jacobian * free
-        normal = rows.T @ rows + (_DAMPING**2 + _MIDDLE_WEIGHT**2) * jnp.eye(NUM_ARM)
-        right = rows.T @ (weights * velocity) + _MIDDLE_WEIGHT**2 * free * middle
+        normal = rows.T @ rows + (DAMPING**2 + MIDDLE_WEIGHT**2) * jnp.eye(NUM_ARM)
+        right = rows.T @ (weights * velocity) + MIDDLE_WEIGHT**2 * free * middle
         speeds = free * jnp.linalg.solve(normal, right)
         room = jnp.where(speeds > 0.0, arm.high - joints, joints - arm.low)
         free = free * jnp.clip(room / _MARGIN, 0.0, 1.0)

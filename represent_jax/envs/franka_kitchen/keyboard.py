@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 
+from represent_jax.envs.franka_kitchen.arm import NUM_ARM, STEP
 from represent_jax.envs.keyboard import Keyboard
 from represent_jax.physics.engine import PhysicsState
 
@@ -25,15 +26,27 @@ _MOVES = {
     "z": ("roll left", 4, -1.0),
     "x": ("roll right", 4, 1.0),
 }
-_NUM_JOINTS, _NUM_ARM = 9, 7
+_NUM_JOINTS = 9
 # What least squares give up first: turning as wanted counts this much of moving as wanted, in m.
-_TURN_WEIGHT, _DAMPING = 0.15, 0.02
+TURN_WEIGHT, DAMPING = 0.15, 0.02
 # Rate at which the hand returns to how it was last turned, per second, and a joint to its middle.
-_TURN_BACK, _TO_MIDDLE, _MIDDLE_WEIGHT = 2.0, 0.3, 0.01
+TURN_BACK, TO_MIDDLE, MIDDLE_WEIGHT = 2.0, 0.3, 0.01
 # A joint this near to its limit, in rad, moves no nearer.
 _MARGIN = 0.02
-# Seconds of an environment step.
-_STEP = 0.08
+
+
+class Fingers:
+    """Open, until space closes them, and so on with every new press."""
+
+    def __init__(self):
+        self._closing, self._space_was_held = False, False
+
+    def action(self, held: frozenset[str]) -> float:
+        """Their entry of the action: 1 opens them, -1 closes."""
+        if " " in held and not self._space_was_held:
+            self._closing = not self._closing
+        self._space_was_held = " " in held
+        return -1.0 if self._closing else 1.0
 
 
 class KitchenKeyboard(Keyboard):
@@ -51,27 +64,24 @@ class KitchenKeyboard(Keyboard):
         }
         self._model, self._data = model, mujoco.MjData(model)
         self._site = model.site("end_effector").id
-        self._low, self._high = model.jnt_range[:_NUM_ARM].T
-        self._stiffness = model.actuator_gainprm[:_NUM_ARM, 0]
+        self._low, self._high = model.jnt_range[:NUM_ARM].T
+        self._stiffness = model.actuator_gainprm[:NUM_ARM, 0]
         # Share of the way to its target that a damped joint goes within one step.
-        self._share = 1.0 - np.exp(-_STEP * self._stiffness / model.dof_damping[:_NUM_ARM])
+        self._share = 1.0 - np.exp(-STEP * self._stiffness / model.dof_damping[:NUM_ARM])
         self.reset()
 
     def reset(self) -> None:
-        self._closing, self._space_was_held = False, False
+        self._fingers = Fingers()
         self._turned: np.ndarray | None = None
 
     def action(self, held: frozenset[str], physics: PhysicsState) -> np.ndarray:
-        if " " in held and not self._space_was_held:
-            self._closing = not self._closing
-        self._space_was_held = " " in held
         data = self._data
         data.qpos[:], data.qvel[:] = physics.qpos, 0.0
         mujoco.mj_forward(self._model, data)
         speeds = self._joint_speeds(self._hand_velocity(held))
-        sag = data.qfrc_bias[:_NUM_ARM] / self._stiffness
-        action = np.full(_NUM_JOINTS, -1.0 if self._closing else 1.0, np.float32)
-        action[:_NUM_ARM] = np.clip(speeds / (2.0 * self._share) + sag / (2.0 * _STEP), -1.0, 1.0)
+        sag = data.qfrc_bias[:NUM_ARM] / self._stiffness
+        action = np.full(_NUM_JOINTS, self._fingers.action(held), np.float32)
+        action[:NUM_ARM] = np.clip(speeds / (2.0 * self._share) + sag / (2.0 * STEP), -1.0, 1.0)
         return action
 
     def _hand_velocity(self, held: frozenset[str]) -> np.ndarray:
@@ -86,12 +96,12 @@ class KitchenKeyboard(Keyboard):
         if self._turned is None:
             self._turned = now.copy()
         # The orientation the keys asked for so far; the hand is led back to it.
-        mujoco.mju_quatIntegrate(self._turned, _in_frame(self._turned, velocity[3:]), _STEP)
+        mujoco.mju_quatIntegrate(self._turned, _in_frame(self._turned, velocity[3:]), STEP)
         back = np.zeros(3)
         mujoco.mju_subQuat(back, self._turned, now)
         world = np.zeros(3)
         mujoco.mju_rotVecQuat(world, back, now)
-        velocity[3:] += _TURN_BACK * world
+        velocity[3:] += TURN_BACK * world
         return velocity
 
     def _joint_speeds(self, velocity: np.ndarray) -> np.ndarray:
@@ -99,19 +109,19 @@ class KitchenKeyboard(Keyboard):
         data = self._data
         jacobian = np.zeros((6, self._model.nv))
         mujoco.mj_jacSite(self._model, data, jacobian[:3], jacobian[3:], self._site)
-        qpos = data.qpos[:_NUM_ARM]
-        weights = np.repeat([1.0, _TURN_WEIGHT], 3)
+        qpos = data.qpos[:NUM_ARM]
+        weights = np.repeat([1.0, TURN_WEIGHT], 3)
         rows = np.concatenate(
             [
-                weights[:, None] * jacobian[:, :_NUM_ARM],
-                _DAMPING * np.eye(_NUM_ARM),
-                _MIDDLE_WEIGHT * np.eye(_NUM_ARM),
+                weights[:, None] * jacobian[:, :NUM_ARM],
+                DAMPING * np.eye(NUM_ARM),
+                MIDDLE_WEIGHT * np.eye(NUM_ARM),
             ]
         )
-        middle = _TO_MIDDLE * (0.5 * (self._low + self._high) - qpos)
-        wanted = np.concatenate([weights * velocity, np.zeros(_NUM_ARM), _MIDDLE_WEIGHT * middle])
-        free, speeds = np.ones(_NUM_ARM, bool), np.zeros(_NUM_ARM)
-        for _ in range(_NUM_ARM):
+        middle = TO_MIDDLE * (0.5 * (self._low + self._high) - qpos)
+        wanted = np.concatenate([weights * velocity, np.zeros(NUM_ARM), MIDDLE_WEIGHT * middle])
+        free, speeds = np.ones(NUM_ARM, bool), np.zeros(NUM_ARM)
+        for _ in range(NUM_ARM):
             speeds[:] = 0.0
             speeds[free] = np.linalg.lstsq(rows[:, free], wanted)[0]
             stuck = (speeds > 0.0) & (qpos > self._high - _MARGIN)
