@@ -200,8 +200,10 @@ def test_keys_move_the_hand_and_only_that_way(keys, axis, sign, name):
     assert np.abs(np.delete(moved, axis)).max() < 0.02
 
 
-@pytest.mark.parametrize("name", ["franka_kitchen", "franka_kitchen_hand"])
-def test_the_hand_stays_where_it_is_and_the_fingers_where_they_were_told(name):
+@pytest.mark.parametrize(
+    ("name", "bound"), [("franka_kitchen", 0.02), ("franka_kitchen_hand", 0.03)]
+)
+def test_the_hand_stays_where_it_is_and_the_fingers_where_they_were_told(name, bound):
     env = make_kitchen(name=name)
     keyboard = env.task.keyboard(env.engine.model)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
@@ -212,7 +214,7 @@ def test_the_hand_stays_where_it_is_and_the_fingers_where_they_were_told(name):
     step = jax.jit(env.step)
     for _ in range(20):
         state = step(state, keyboard.action(frozenset(), state.pipeline_state))
-    assert np.abs(state.obs[:7] - physics.qpos[:7]).max() < 0.03
+    assert np.abs(state.obs[:7] - physics.qpos[:7]).max() < bound
     assert isinstance(physics, PhysicsState)
 
 

@@ -62,8 +62,10 @@ def test_unknown_strategies_are_errors():
         Operator(strategy="pull")
 
 
-@pytest.mark.parametrize(("name", "successes"), [("franka_kitchen", 5), ("franka_kitchen_hand", 1)])
-def test_what_ships_is_at_the_papers_level_and_says_who_made_it(name, successes):
+@pytest.mark.parametrize(
+    ("name", "successes", "best"), [("franka_kitchen", 5, -80.0), ("franka_kitchen_hand", 1, -85.0)]
+)
+def test_what_ships_is_at_the_papers_level_and_says_who_made_it(name, successes, best):
     demonstrations = rj.load_demonstrations(name)
     for strategy, target in enumerate(OperatorsConfig().target_returns):
         assert abs(demonstrations.mean_return(strategy) / target - 1.0) < 0.05
@@ -71,6 +73,6 @@ def test_what_ships_is_at_the_papers_level_and_says_who_made_it(name, successes)
     assert np.sum(demonstrations.metadata["outcomes"]["success"][:5]) >= successes
     test = rj.load_demonstrations(f"{name}_test")
     returns = np.array([t.total_reward for t in test.trajectories])
-    assert len(returns) == 50 and returns.min() < -200.0 and returns.max() > -85.0
+    assert len(returns) == 50 and returns.min() < -200.0 and returns.max() > best
     for data in (demonstrations, test):
         assert "scripted operators" in data.metadata["source"]

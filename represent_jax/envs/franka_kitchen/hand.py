@@ -15,6 +15,7 @@ from represent_jax.envs.franka_kitchen.keyboard import (
     DAMPING,
     LINEAR_SPEED,
     MIDDLE_WEIGHT,
+    OTHER_KEYS,
     SLOW,
     TO_MIDDLE,
     TURN_BACK,
@@ -83,10 +84,7 @@ class HandKeyboard(Keyboard):
     """Keys for the entries of the action; roll and fingers stay as they were told."""
 
     def __init__(self):
-        self.keys = {key: does for key, (does, _, _) in _MOVES.items()} | {
-            " ": "close or open the fingers",
-            "shift": "slowly",
-        }
+        self.keys = {key: does for key, (does, _, _) in _MOVES.items()} | OTHER_KEYS
         self.reset()
 
     def reset(self) -> None:

@@ -26,6 +26,8 @@ _MOVES = {
     "z": ("roll left", 4, -1.0),
     "x": ("roll right", 4, 1.0),
 }
+# Of both ways to drive the hand.
+OTHER_KEYS = {" ": "close or open the fingers", "shift": "slowly"}
 _NUM_JOINTS = 9
 # What least squares give up first: turning as wanted counts this much of moving as wanted, in m.
 TURN_WEIGHT, DAMPING = 0.15, 0.02
@@ -58,10 +60,7 @@ class KitchenKeyboard(Keyboard):
 
     def __init__(self, model: mujoco.MjModel):
         """Takes the scene's model, full or light."""
-        self.keys = {key: does for key, (does, _, _) in _MOVES.items()} | {
-            " ": "close or open the fingers",
-            "shift": "slowly",
-        }
+        self.keys = {key: does for key, (does, _, _) in _MOVES.items()} | OTHER_KEYS
         self._model, self._data = model, mujoco.MjData(model)
         self._site = model.site("end_effector").id
         self._low, self._high = model.jnt_range[:NUM_ARM].T
