@@ -84,9 +84,18 @@ def apply_overrides(config: C, overrides: Sequence[str]) -> C:
     return from_dict(type(config), values)
 
 
-def to_plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a mapping that may hold configurations as nested dictionaries that JSON can hold."""
-    return _plain(values)
+def later(default: Any) -> Any:
+    """A field that came after results were kept: at its default it leaves `identity` as it was."""
+    return dataclasses.field(default=default, metadata={"later": True})
+
+
+def identity(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what tells settings apart: a mapping that may hold configurations, as `to_dict`.
+
+    Fields made by `later` are left out at their default, so that results kept before the field
+    existed are found again.
+    """
+    return {name: _identity(value) for name, value in values.items()}
 
 
 def config_hash(config: Any) -> str:
@@ -106,6 +115,19 @@ def diff(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
         elif _plain(a[key]) != _plain(b[key]):
             keys.append(key)
     return keys
+
+
+def _identity(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return identity(value)
+    if not dataclasses.is_dataclass(value):
+        return _plain(value)
+    held = {field: getattr(value, field.name) for field in dataclasses.fields(value)}
+    return {
+        field.name: _identity(one)
+        for field, one in held.items()
+        if not (field.metadata.get("later") and one == field.default)
+    }
 
 
 def _plain(value: Any) -> Any:

@@ -129,6 +129,24 @@ def test_hash_tells_configurations_apart_and_takes_dictionaries():
     assert len(config.config_hash(RUN)) == 12
 
 
+@dataclasses.dataclass(frozen=True)
+class Grown(Optimizer):
+    entries: tuple[int, ...] = config.later(())
+
+
+def test_identity_is_kept_by_a_later_field_at_its_default_alone():
+    before = config.identity({"seed": 1, "each": Optimizer(), "sizes": (2, 3)})
+    assert before == {
+        "seed": 1,
+        "each": {"learning_rate": 3e-4, "decay": None},
+        "sizes": [2, 3],
+    }
+    assert config.identity({"seed": 1, "each": Grown(), "sizes": (2, 3)}) == before
+    changed = config.identity({"each": {"inner": Grown(entries=(4,))}})
+    assert changed["each"]["inner"]["entries"] == [4]
+    assert config.to_dict(Grown())["entries"] == []
+
+
 def test_diff_names_the_dotted_keys():
     a, b = config.to_dict(Run("b")), config.to_dict(RUN)
     assert config.diff(a, a) == []

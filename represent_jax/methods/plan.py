@@ -138,7 +138,7 @@ def nodes(
         made[stage.name] = Node(
             kind=f"{config.env} {stage.name}",
             name=f"{name} {stage.name}",
-            settings={**(judged if stage.reports else common), **configs.to_plain(stage.settings)},
+            settings={**(judged if stage.reports else common), **configs.identity(stage.settings)},
             inputs=tuple(made[before] for before in stage.inputs),
             run=functools.partial(run_stage, config.seed, stage),
         )

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from represent_jax.config import require
+from represent_jax.config import later, require
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.stages.mlp import Mlp, squared_kernels
 from represent_jax.types import Metrics, Params
@@ -62,6 +62,8 @@ class RegressionConfig:
       discrimination: reading of Eq. 5.
       discrimination_ratio: w, target of exp u_i(m) / exp u_i(i).
       include_action: whether rewards see state and action as well as the next state.
+      task_entries: entries of the next observation that R^0 sees, such as the objects that a task
+        is about; everything that a R~^i sees if empty.
     """
 
     num_updates: int = 3000
@@ -84,6 +86,7 @@ class RegressionConfig:
     discrimination: str = "log_ratio"
     discrimination_ratio: float = 0.7
     include_action: bool = False
+    task_entries: tuple[int, ...] = later(())
 
     def __post_init__(self) -> None:
         for field in ("num_updates", "num_snippets", "ensemble_size", "min_snippet_steps"):
@@ -112,6 +115,12 @@ class RegressionConfig:
             "discrimination_ratio",
             "in (0, 1]",
             self.discrimination_ratio,
+        )
+        require(
+            all(entry >= 0 for entry in self.task_entries),
+            "task_entries",
+            "indices from 0",
+            self.task_entries,
         )
 
 
@@ -177,17 +186,29 @@ def _optimizer(config: RegressionConfig) -> optax.GradientTransformation:
 def init(
     key: jax.Array, obs_dim: int, action_dim: int, num_strategies: int, config: RegressionConfig
 ) -> RegressionState:
-    """Draws all heads of all ensemble members."""
+    """Draws all heads of all ensemble members.
+
+    Raises:
+      UsageError: R^0 is to see entries that an observation does not have.
+    """
+    require(
+        all(entry < obs_dim for entry in config.task_entries),
+        "task_entries",
+        f"indices of an observation of size {obs_dim}",
+        config.task_entries,
+    )
     key_task, key_strategies, key = jax.random.split(key, 3)
     input_dim = obs_dim + (obs_dim + action_dim if config.include_action else 0)
     head = _head(config)
 
-    def draw(key):
+    def draw(key, input_dim):
         return head.init(key, jnp.zeros(input_dim))
 
     shape = (config.ensemble_size, num_strategies)
-    task = jax.vmap(draw)(jax.random.split(key_task, config.ensemble_size))
-    strategies = jax.vmap(jax.vmap(draw))(jax.random.split(key_strategies, shape))
+    keys = jax.random.split(key_task, config.ensemble_size)
+    task = jax.vmap(lambda key: draw(key, len(config.task_entries) or input_dim))(keys)
+    keys = jax.random.split(key_strategies, shape)
+    strategies = jax.vmap(jax.vmap(lambda key: draw(key, input_dim)))(keys)
     rewards = Rewards(task, strategies)
     return RegressionState(rewards, _optimizer(config).init(rewards), key)
 
@@ -195,10 +216,15 @@ def init(
 def inputs_of(
     obs_t: jax.Array, action_t: jax.Array | None, next_obs_t: jax.Array, config: RegressionConfig
 ) -> jax.Array:
-    """What a head sees: the state that the action led to, and on request what came before."""
+    """What a R~^i sees: the state that the action led to, and on request what came before."""
     if not config.include_action:
         return next_obs_t
     return jnp.concatenate([next_obs_t, obs_t, action_t], axis=-1)
+
+
+def task_inputs_of(inputs: jax.Array, config: RegressionConfig) -> jax.Array:
+    """What R^0 sees of it, `[..., task_input_dim]`."""
+    return inputs[..., config.task_entries] if config.task_entries else inputs
 
 
 def sample_snippets(
@@ -294,7 +320,7 @@ def loss(
     head = _head(config)
     num_strategies, num_states, input_dim = demonstration_inputs.shape
     unit = horizon / config.return_scale
-    rho_task = unit * head.apply(rewards.task, snippets.inputs)
+    rho_task = unit * head.apply(rewards.task, task_inputs_of(snippets.inputs, config))
     rho_own = unit * jax.vmap(head.apply)(rewards.strategies, snippets.inputs)
     alpha = config.strategy_weight
     ssrr = jax.vmap(ssrr_loss, in_axes=(0, 0, None))(
@@ -304,7 +330,8 @@ def loss(
     flat = demonstration_inputs.reshape(-1, input_dim)
     rho_cross = unit * jax.vmap(head.apply, in_axes=(0, None))(rewards.strategies, flat)
     rho_cross = rho_cross.reshape(num_strategies, num_strategies, num_states)
-    rho_task_demo = unit * jax.lax.stop_gradient(head.apply(rewards.task, demonstration_inputs))
+    task_inputs = task_inputs_of(demonstration_inputs, config)
+    rho_task_demo = unit * jax.lax.stop_gradient(head.apply(rewards.task, task_inputs))
     utility = jnp.mean(rho_task_demo[None] + alpha * rho_cross, axis=-1)
     reg = jnp.sum(jnp.mean(jnp.square(rho_own), axis=(1, 2)))
     reg += jnp.sum(jnp.mean(jnp.square(rho_cross), axis=(1, 2)))
@@ -375,15 +402,14 @@ def train(
     return state, jax.tree.map(jnp.mean, metrics)
 
 
-def head_reward(
-    head: Params,
-    obs_t: jax.Array,
-    action_t: jax.Array,
-    next_obs_t: jax.Array,
-    config: RegressionConfig,
-) -> jax.Array:
-    """Reward of one head, R^0 or R~^i: the mean over its ensemble `[ensemble, ...]`, `[...]`."""
-    inputs = inputs_of(obs_t, action_t, next_obs_t, config)
+def head_reward(head: Params, inputs: jax.Array, config: RegressionConfig) -> jax.Array:
+    """Reward of one head, R^0 or R~^i: the mean over its ensemble `[ensemble, ...]`, `[...]`.
+
+    Args:
+      head: parameters.
+      inputs: of `inputs_of`, for R^0 of `task_inputs_of`.
+      config: settings.
+    """
     return jnp.mean(jax.vmap(_head(config).apply, in_axes=(0, None))(head, inputs), axis=0)
 
 
@@ -415,9 +441,9 @@ def view_reward(
     config: RegressionConfig,
 ) -> jax.Array:
     """R^0 or R^i, `[...]`."""
-    inputs = (obs_t, action_t, next_obs_t, config)
-    own = head_reward(view.own, *inputs)
-    return head_reward(view.task, *inputs) + view.strategy_weight * own
+    inputs = inputs_of(obs_t, action_t, next_obs_t, config)
+    task = head_reward(view.task, task_inputs_of(inputs, config), config)
+    return task + view.strategy_weight * head_reward(view.own, inputs, config)
 
 
 def reward(

@@ -1,6 +1,7 @@
 """Phase 3: each term of Eq. 2 in closed form, and a synthetic problem with a known answer."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -106,9 +107,34 @@ def test_reward_is_task_plus_weighted_strategy():
     obs = jax.random.normal(jax.random.PRNGKey(1), (7, 3))
     task = regression.reward(rewards, obs, None, obs, config)
     head = jax.tree.map(lambda leaf: leaf[:, 1], rewards.strategies)
-    own = regression.head_reward(head, obs, None, obs, config)
+    own = regression.head_reward(head, obs, config)
     found = regression.reward(rewards, obs, None, obs, config, strategy=1)
     np.testing.assert_allclose(found, task + 0.5 * own, rtol=1e-6)
+
+
+def test_task_reward_sees_its_entries_and_strategies_see_all():
+    config = dataclasses.replace(CONFIG, task_entries=(2, 0), include_action=True)
+    rewards = regression.init(jax.random.PRNGKey(0), 3, 1, 2, config).rewards
+    row = jax.random.normal(jax.random.PRNGKey(1), (3,))
+    action = jnp.array([0.3])
+
+    def slopes(strategy):
+        reward = functools.partial(regression.reward, rewards, config=config, strategy=strategy)
+        by = jax.grad(lambda *rows: reward(*rows), argnums=(0, 1, 2))(row, action, row)
+        return [np.abs(slope) > 0.0 for slope in by]
+
+    before, by_action, after = slopes(None)
+    assert not before.any() and not by_action.any()
+    np.testing.assert_array_equal(after, [True, False, True])
+    assert all(seen.all() for seen in slopes(1))
+
+
+def test_task_entries_outside_the_observation_are_refused():
+    config = dataclasses.replace(CONFIG, task_entries=(0, 3))
+    with pytest.raises(UsageError, match=r"task_entries.*size 3.*\(0, 3\)"):
+        regression.init(jax.random.PRNGKey(0), 3, 1, 2, config)
+    with pytest.raises(UsageError, match="task_entries"):
+        dataclasses.replace(CONFIG, task_entries=(-1,))
 
 
 def test_known_reward_is_recovered_and_decomposed():

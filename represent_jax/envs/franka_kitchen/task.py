@@ -53,8 +53,9 @@ _AMPLITUDES = (0.1, *[0.005] * 2, *[5e-4] * 6, *[0.005] * 3, *[0.1] * 3, *[0.005
 _SPEED_AMPLITUDES = (*[0.005] * 11, *[0.1] * 3, *[0.005] * 3, *[0.1] * 3)
 OBSERVATION_NOISE = np.array([*[1e-3] * 18, *(5e-4 * np.array([*_AMPLITUDES, *_SPEED_AMPLITUDES]))])
 
-# The kettle's place in an observation.
-_KETTLE = slice(2 * NUM_JOINTS + NUM_FIXTURES, 2 * NUM_JOINTS + NUM_FIXTURES + 7)
+# The kettle's place in an observation: where it is and how it is turned.
+KETTLE_ENTRIES = range(2 * NUM_JOINTS + NUM_FIXTURES, 2 * NUM_JOINTS + NUM_FIXTURES + 7)
+_KETTLE = slice(KETTLE_ENTRIES.start, KETTLE_ENTRIES.stop)
 _REACHED, _UPRIGHT = 0.05, np.cos(np.deg2rad(15.0))
 
 
