@@ -1,11 +1,12 @@
 """The paper's tables from records, beside the paper's own figures."""
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from represent_jax.campaign import paper
 from represent_jax.campaign.statistics import Aggregate, aggregate
-from represent_jax.campaign.variants import ABLATIONS, GYM_DOMAINS, NUMS_STRATEGIES
+from represent_jax.campaign.variants import ABLATIONS, GYM_DOMAINS, KITCHENS, NUMS_STRATEGIES
 from represent_jax.errors import RepresentError, unknown
 from represent_jax.report.tables import Table
 from represent_jax.report.values import display_name, format_number
@@ -15,6 +16,7 @@ DOMAIN_NAMES = {
     "half_cheetah": "HalfCheetah",
     "inverted_double_pendulum": "Double pendulum",
     "franka_kitchen": "Franka Kitchen",
+    "franka_kitchen_hand": "Franka Kitchen, by hand",
 }
 METHOD_NAMES = {
     "represent": "REPRESENT",
@@ -139,8 +141,8 @@ def ablations(select: Select) -> list[Cell]:
 
 def kitchen(select: Select) -> list[Cell]:
     """Table IV: policies in Franka Kitchen, what their episodes come to, and the rewards."""
-    domain, cells = "franka_kitchen", []
-    for target in _TARGETS:
+    cells = []
+    for domain, target in itertools.product(KITCHENS, _TARGETS):
         cells.append(_demonstrated(select, domain, target))
         for method in ("represent", "ssrr", "msrd", "bc"):
             published = paper.KITCHEN.get((target, method))
@@ -307,7 +309,7 @@ def _digits(cell: Cell) -> int:
     if cell.quantity.startswith("pearson") or cell.quantity in _OUTCOMES:
         return 3
     # Returns of the kitchen are a hundredth of the others'.
-    return 2 if cell.domain == "franka_kitchen" else 0
+    return 2 if cell.domain in KITCHENS else 0
 
 
 def _row_name(cell: Cell) -> str:
@@ -350,7 +352,7 @@ def _demonstrated(
     given = paper.THREE_STRATEGIES.get((target, "demonstrators"))
     if num_strategies == 2:
         given = paper.RETURNS.get((domain, target, "demonstrators"))
-    if domain == "franka_kitchen":
+    if domain in KITCHENS:
         given = paper.KITCHEN.get((target, "demonstrators"))
     published = None if given is None else (given,)
     return Cell(domain, target, "demonstrators", "demo_return", found, published)

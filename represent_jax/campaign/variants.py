@@ -9,7 +9,9 @@ from represent_jax.methods.config import MethodConfig
 from represent_jax.methods.presets import make_config
 
 GYM_DOMAINS = ("hopper", "half_cheetah", "inverted_double_pendulum")
-DOMAINS = (*GYM_DOMAINS, "franka_kitchen")
+# The paper's, driven by joint velocities, and the same driven by the hand.
+KITCHENS = ("franka_kitchen", "franka_kitchen_hand")
+DOMAINS = (*GYM_DOMAINS, *KITCHENS)
 
 # Of the eight demonstrators of HalfCheetah, how many are taken: the first ones.
 NUMS_STRATEGIES = (1, 2, 3, 5, 8)
@@ -116,7 +118,7 @@ TABLES = {
         dict.fromkeys(("represent", "no_reg", "no_bcd", "ssrr", "ssrr_separate"), _POLICIES),
     ),
     "4": TableRuns(
-        ("franka_kitchen",),
+        KITCHENS,
         dict.fromkeys(
             (
                 *("represent", "ssrr", "ssrr_separate", "msrd"),
