@@ -7,7 +7,7 @@ from represent_jax.config import require
 from represent_jax.data.trajectories import Demonstrations, Trajectory, without_pauses
 from represent_jax.envs import Environment, Episode
 from represent_jax.errors import RepresentError, UsageError, unknown
-from represent_jax.stages import airl, policies
+from represent_jax.stages import airl, policies, regression
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.curve import CurveConfig
 from represent_jax.stages.noise import NoiseConfig
@@ -95,6 +95,9 @@ class MethodConfig:
         """What in these settings needs demonstrated actions; empty where states are enough."""
         return ""
 
+    def check_against(self, obs_dim: int) -> None:
+        """Refuses settings that observations of this size do not fit."""
+
 
 @dataclasses.dataclass(frozen=True)
 class OneGroupConfig(MethodConfig):
@@ -159,6 +162,9 @@ class RepresentConfig(MethodConfig):
             return "airl.discriminator.state_only=false"
         return "regression.include_action=true" if self.regression.include_action else ""
 
+    def check_against(self, obs_dim: int) -> None:
+        regression.check_entries(self.regression, obs_dim)
+
 
 class Problem(NamedTuple):
     """What the method is given.
@@ -185,10 +191,12 @@ def make_problem(
     """Checks demonstrations and test trajectories against the environment and cuts them to size.
 
     Raises:
-      UsageError: actions are missing that the method needs, or the test's true rewards.
+      UsageError: actions are missing that the method needs, or the test's true rewards, or a
+        setting does not fit the environment.
       RepresentError: they do not fit the environment, or too few strategies are demonstrated.
     """
     horizon = config.horizon or env.horizon
+    config.check_against(env.observation_size)
     for what, data in (("demonstrations", demonstrations), ("test trajectories", test)):
         if data is None:
             continue

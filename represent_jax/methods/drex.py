@@ -69,9 +69,8 @@ class DrexConfig(OneGroupConfig):
 
 
 def configure(settings: dict[str, Any]) -> dict[str, Any]:
-    """Turns a preset's settings of stages into D-REX's: policies start from random networks."""
-    own = settings.get("policies", PoliciesConfig())
-    return settings | {"policies": dataclasses.replace(own, start="cold")}
+    """Turns the settings of a preset and a domain into D-REX's: policies start anew."""
+    return settings | {"policies": dataclasses.replace(settings["policies"], start="cold")}
 
 
 def plan(

@@ -25,7 +25,7 @@ class Method(NamedTuple):
       plan: its stages, `plan(config, problem, checkpoint_seconds)`, for `methods.plan`.
       load_rewards, load_policies: from settings, environment and run directory to functions
         `reward(obs_t, action_t, next_obs_t)` and `policy(obs)`, by target.
-      configure: turns a preset's settings of stages into those of the method.
+      configure: turns the settings of a preset and a domain, by name, into the method's.
     """
 
     config: type[MethodConfig]

@@ -45,8 +45,8 @@ class SsrrConfig(RepresentConfig):
 
 
 def configure(settings: dict[str, Any]) -> dict[str, Any]:
-    """Turns a preset's settings of stages into SSRR's."""
-    own = settings.get("regression", RegressionConfig())
+    """Turns the settings of a preset and a domain into SSRR's."""
+    own = settings["regression"]
     own = dataclasses.replace(own, strategy_weight=0.0, lambda_reg=0.0, lambda_bcd=0.0)
     return settings | {"regression": own}
 

@@ -183,6 +183,16 @@ def _optimizer(config: RegressionConfig) -> optax.GradientTransformation:
     return optax.adam(config.learning_rate)
 
 
+def check_entries(config: RegressionConfig, obs_dim: int) -> None:
+    """Raises a UsageError where R^0 is to see entries that an observation does not have."""
+    require(
+        all(entry < obs_dim for entry in config.task_entries),
+        "task_entries",
+        f"indices of an observation of size {obs_dim}",
+        config.task_entries,
+    )
+
+
 def init(
     key: jax.Array, obs_dim: int, action_dim: int, num_strategies: int, config: RegressionConfig
 ) -> RegressionState:
@@ -191,12 +201,7 @@ def init(
     Raises:
       UsageError: R^0 is to see entries that an observation does not have.
     """
-    require(
-        all(entry < obs_dim for entry in config.task_entries),
-        "task_entries",
-        f"indices of an observation of size {obs_dim}",
-        config.task_entries,
-    )
+    check_entries(config, obs_dim)
     key_task, key_strategies, key = jax.random.split(key, 3)
     input_dim = obs_dim + (obs_dim + action_dim if config.include_action else 0)
     head = _head(config)

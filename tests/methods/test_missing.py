@@ -68,6 +68,13 @@ def test_methods_that_need_actions_refuse_states_alone(env, shown, method, overr
         make_problem(config, env, states)
 
 
+def test_settings_that_observations_do_not_fit_are_refused_before_any_stage(env, shown):
+    config = apply_overrides(make_config("smoke", ENV), ["regression.task_entries=0,99"])
+    size = env.observation_size
+    with pytest.raises(UsageError, match=rf"task_entries: .*size {size}, found \(0, 99\)"):
+        make_problem(config, env, shown)
+
+
 def test_test_trajectories(env, shown):
     config = make_config("smoke", ENV)
     assert make_problem(config, env, shown).test == ()
