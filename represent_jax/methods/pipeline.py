@@ -148,16 +148,47 @@ def run_rollouts(
     return output
 
 
-def fit_curves(config: RepresentConfig, noisy: noise.NoisyData) -> curve.Curve:
+def fit_curves(
+    config: RepresentConfig, problem: Problem, first: airl.AirlOutput, noisy: noise.NoisyData
+) -> curve.Curve:
     """The noise-performance curve of every strategy; leaves are `[num_strategies, ...]`.
 
     Raises:
       RepresentError: Phase 1's reward is not finite.
     """
+    returns = noisy.returns
+    if config.curve.reward_floor is not None:
+        returns = floored_returns(config, transitions_of(problem.lessons), first, noisy)
     fit = jax.vmap(lambda levels, returns: curve.fit(levels, returns, config.curve))
-    curves = jax.jit(fit)(noisy.levels, noisy.returns)
+    curves = jax.jit(fit)(noisy.levels, returns)
     _check_curves(curves)
     return curves
+
+
+def floored_returns(
+    config: RepresentConfig,
+    demonstrations: list[Transition],
+    first: airl.AirlOutput,
+    noisy: noise.NoisyData,
+) -> jax.Array:
+    """Initial returns in which no step counts less than `curve.reward_floor` says.
+
+    Returns:
+      `[num_strategies, num_levels, trajectories_per_level]`.
+    """
+
+    @jax.vmap
+    def judge(params, rows, trajectories):
+        demonstrated = airl.reward(params, *rows[:3], config.airl)
+        floor = jnp.quantile(demonstrated, config.curve.reward_floor)
+
+        def reward(params, *transition):
+            return jnp.maximum(airl.reward(params, *transition, config.airl), floor)
+
+        return noise.judge(trajectories, reward, params)
+
+    returns = jax.jit(judge)(first.reward, stack(demonstrations), noisy.trajectories)
+    return returns.reshape(noisy.returns.shape)
 
 
 def _check_curves(curves: curve.Curve) -> None:

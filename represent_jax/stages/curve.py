@@ -71,6 +71,10 @@ class CurveConfig:
     Attributes:
         statistic: what stands for the trajectories of a level: their "median", which one fallen
             robot does not move, or the "mean" of the paper.
+        reward_floor: no step of a rollout counts less than this quantile of the demonstrated
+            steps' initial rewards; None: whatever they count. Noise leads where no demonstration
+            was, where the initial reward is extrapolated: one level at which robots fall would set
+            the scale of all others.
         targets: what the regression learns from: the "curve", or the "returns" of each level as
             they are, without a curve through them (an ablation).
         num_iterations: Levenberg-Marquardt iterations of every start.
@@ -86,6 +90,7 @@ class CurveConfig:
     """
 
     statistic: str = "median"
+    reward_floor: float | None = 0.001
     targets: str = "curve"
     num_iterations: int = 60
     steepest: float = 50.0
@@ -102,6 +107,8 @@ class CurveConfig:
         require(
             self.targets in ("curve", "returns"), "targets", "'curve' or 'returns'", self.targets
         )
+        floor = self.reward_floor
+        require(floor is None or 0.0 <= floor < 1.0, "reward_floor", "none, or in [0, 1)", floor)
         require(self.num_iterations >= 1, "num_iterations", "at least 1", self.num_iterations)
         require(
             0 < self.flattest < self.steepest <= 100,

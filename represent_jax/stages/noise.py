@@ -73,10 +73,6 @@ def run(
 ) -> NoisyData:
     """Rolls out one strategy at every level; vmap over strategies.
 
-    An episode that ends early is judged as if it stayed in its last state until the horizon:
-    the initial reward is known up to a constant, and a sum over fewer steps would turn that
-    constant into a preference for short or for long episodes.
-
     Args:
       key: PRNG key.
       env: episodes without auto-reset.
@@ -87,6 +83,16 @@ def run(
     levels = levels_of(config)
     each = jnp.repeat(levels, config.trajectories_per_level)
     batch = rollouts.rollout(env, policy, policy_params, key, each)
-    whole = batch._replace(mask=jnp.ones_like(batch.mask))
-    returns = rollouts.learned_returns(whole, reward_fn, reward_params)
+    returns = judge(batch, reward_fn, reward_params)
     return NoisyData(batch, levels, returns.reshape(config.num_levels, -1))
+
+
+def judge(batch: TrajectoryBatch, reward_fn: RewardFn, reward_params: Params) -> jax.Array:
+    """What the initial reward makes of rollouts, `[num_trajectories]`.
+
+    An episode that ends early is judged as if it stayed in its last state until the horizon:
+    the initial reward is known up to a constant, and a sum over fewer steps would turn that
+    constant into a preference for short or for long episodes.
+    """
+    whole = batch._replace(mask=jnp.ones_like(batch.mask))
+    return rollouts.learned_returns(whole, reward_fn, reward_params)
