@@ -35,12 +35,6 @@ def require(condition: bool, field: str, expected: str, found: Any) -> None:
         raise UsageError(f"{field}: expected {expected}, found {found!r}")
 
 
-def require_entries(entries: tuple[int, ...], field: str, size: int) -> None:
-    """Raises a UsageError unless entries are indices of an observation of that size."""
-    fit = all(0 <= entry < size for entry in entries)
-    require(fit, field, f"indices of an observation of size {size}", entries)
-
-
 def to_dict(config: Any) -> dict[str, Any]:
     """Returns the configuration as nested dictionaries that JSON can hold (tuples become lists)."""
     return {f.name: _plain(getattr(config, f.name)) for f in dataclasses.fields(config)}

@@ -3,11 +3,11 @@
 import dataclasses
 from typing import NamedTuple
 
-from represent_jax.config import require, require_entries
+from represent_jax.config import require
 from represent_jax.data.trajectories import Demonstrations, Trajectory, without_pauses
 from represent_jax.envs import Environment, Episode
 from represent_jax.errors import RepresentError, UsageError, unknown
-from represent_jax.stages import airl, policies
+from represent_jax.stages import airl, policies, regression
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.curve import CurveConfig
 from represent_jax.stages.noise import NoiseConfig
@@ -163,12 +163,7 @@ class RepresentConfig(MethodConfig):
         return "regression.include_action=true" if self.regression.include_action else ""
 
     def check_against(self, obs_dim: int) -> None:
-        own = {
-            "regression.task_entries": self.regression.task_entries,
-            "airl.discriminator.task_entries": self.airl.discriminator.task_entries,
-        }
-        for field, entries in own.items():
-            require_entries(entries, field, obs_dim)
+        regression.check_entries(self.regression, obs_dim)
 
 
 class Problem(NamedTuple):

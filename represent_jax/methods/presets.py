@@ -101,7 +101,6 @@ _KITCHEN = (
     # R^0 sees the kettle alone: what holds its handle fails under any noise, so that all that
     # tells its noise levels apart is how the hand is held, and that is no matter of the task.
     f"regression.task_entries={','.join(map(str, KETTLE_ENTRIES))}",
-    f"airl.discriminator.task_entries={','.join(map(str, KETTLE_ENTRIES))}",
     # R~^i sees so much more than R^0 that by itself it would explain the curve and leave to R^0
     # what is left over: at 0.1 R^0 orders noise levels backwards.
     "regression.lambda_reg=5",

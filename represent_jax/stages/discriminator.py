@@ -20,7 +20,7 @@ import optax
 from brax.training import networks as brax_networks
 from flax import linen, struct
 
-from represent_jax.config import later, require, require_entries
+from represent_jax.config import require
 from represent_jax.types import Metrics, Params, Transition
 
 # Bound on the inputs of g and h, in deviations of the demonstrations.
@@ -33,8 +33,6 @@ class DiscriminatorConfig:
 
     Attributes:
       state_only: whether g sees the next state alone, or state and action too.
-      task_entries: entries of the next observation that g sees, such as the objects that a task is
-        about, if not all; h sees all.
       hidden_sizes: units of the hidden layers of g and h.
       learning_rate: AdamW step size.
       weight_decay: AdamW weight decay.
@@ -54,15 +52,8 @@ class DiscriminatorConfig:
     gradient_penalty: float = 1.0
     shaping_discount: float = 0.99
     log_prob_clip: float = 1.0
-    task_entries: tuple[int, ...] = later(())
 
     def __post_init__(self) -> None:
-        require(
-            self.state_only or not self.task_entries,
-            "task_entries",
-            "none where state_only is false",
-            self.task_entries,
-        )
         for field in ("batch_size", "updates_per_step"):
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
         require(self.learning_rate > 0.0, "learning_rate", "positive", self.learning_rate)
@@ -117,15 +108,10 @@ def _networks(config: DiscriminatorConfig):
 def init(
     key: jax.Array, demonstrations: Transition, config: DiscriminatorConfig
 ) -> DiscriminatorState:
-    """Draws g and h, and takes the inputs' statistics from `[num_transitions]` rows.
-
-    Raises:
-      UsageError: g is to see entries that an observation does not have.
-    """
+    """Draws g and h, and takes the inputs' statistics from `[num_transitions]` rows."""
     obs = demonstrations.obs_t
     obs_dim = obs.shape[-1]
-    require_entries(config.task_entries, "task_entries", obs_dim)
-    input_dim = len(config.task_entries) or obs_dim
+    input_dim = obs_dim
     if not config.state_only:
         input_dim += obs_dim + demonstrations.action_t.shape[-1]
     module, optimizer = _networks(config)
@@ -150,8 +136,6 @@ def reward(
     """g alone, the reward without shaping, `[...]`."""
     module, _ = _networks(config)
     inputs = _normalize(params, next_obs_t)
-    if config.task_entries:
-        inputs = inputs[..., config.task_entries]
     if not config.state_only:
         inputs = jnp.concatenate([inputs, _normalize(params, obs_t), action_t], axis=-1)
     return module.apply(params.g, inputs)[..., 0]

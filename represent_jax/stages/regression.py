@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from represent_jax.config import later, require, require_entries
+from represent_jax.config import later, require
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.stages.mlp import Mlp, squared_kernels
 from represent_jax.types import Metrics, Params
@@ -183,6 +183,16 @@ def _optimizer(config: RegressionConfig) -> optax.GradientTransformation:
     return optax.adam(config.learning_rate)
 
 
+def check_entries(config: RegressionConfig, obs_dim: int) -> None:
+    """Raises a UsageError where R^0 is to see entries that an observation does not have."""
+    require(
+        all(entry < obs_dim for entry in config.task_entries),
+        "task_entries",
+        f"indices of an observation of size {obs_dim}",
+        config.task_entries,
+    )
+
+
 def init(
     key: jax.Array, obs_dim: int, action_dim: int, num_strategies: int, config: RegressionConfig
 ) -> RegressionState:
@@ -191,7 +201,7 @@ def init(
     Raises:
       UsageError: R^0 is to see entries that an observation does not have.
     """
-    require_entries(config.task_entries, "task_entries", obs_dim)
+    check_entries(config, obs_dim)
     key_task, key_strategies, key = jax.random.split(key, 3)
     input_dim = obs_dim + (obs_dim + action_dim if config.include_action else 0)
     head = _head(config)

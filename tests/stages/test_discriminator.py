@@ -68,24 +68,6 @@ def test_advantage_is_g_plus_discounted_potential_difference():
     np.testing.assert_allclose(discriminator.advantage(params, ended, CONFIG), g - h, rtol=1e-5)
 
 
-def test_g_sees_its_entries_and_shaping_sees_all():
-    config = dataclasses.replace(CONFIG, task_entries=(2, 0))
-    params = discriminator.init(jax.random.PRNGKey(0), _transition(jax.random.PRNGKey(1)), config)
-    row = jax.tree.map(lambda x: x[0], _transition(jax.random.PRNGKey(2)))
-
-    def slopes(of):
-        slope = jax.grad(lambda next_obs_t: of(row._replace(next_obs_t=next_obs_t)))(row.next_obs_t)
-        return np.abs(slope) > 0.0
-
-    def g(row):
-        return discriminator.reward(params.params, *row[:3], config)
-
-    np.testing.assert_array_equal(slopes(g), [True, False, True])
-    assert slopes(lambda row: discriminator.advantage(params.params, row, config)).all()
-    with pytest.raises(UsageError, match="task_entries"):
-        discriminator.DiscriminatorConfig(state_only=False, task_entries=(0,))
-
-
 def test_state_only_reward_ignores_actions_and_the_other_does_not():
     rows = _transition(jax.random.PRNGKey(0))
     for state_only in (True, False):
