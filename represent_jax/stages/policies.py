@@ -36,7 +36,8 @@ class PoliciesConfig:
         "last".
       center: subtracted from rho at every step, unless episodes can end early: there a negative
         reward would pay for ending them.
-      center_on_start: whether what the policy it starts from earns a step is subtracted instead.
+      center_on_start: whether to subtract what the policy it starts from earns a step instead,
+        where there is one.
       eval_env_steps: environment steps between two evaluations.
       eval_episodes: deterministic episodes of an evaluation.
       sac, ppo: the agents.
