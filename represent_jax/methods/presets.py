@@ -140,8 +140,6 @@ DOMAINS: dict[str, tuple[str, ...]] = {
         # levels below, and that one level sets the lower end of the curve's scale.
         "noise.num_levels=17",
         *_GENTLE_IMITATION,
-        # The game does not settle here: one discriminator knows the last generator's faults only.
-        "airl.reward_average_rate=3e-4",
         "policies.sac.prior_weight=0.05",
     ),
 }

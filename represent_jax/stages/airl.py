@@ -18,7 +18,7 @@ from represent_jax.agents import cloning, ppo, replay, sac
 from represent_jax.agents.ppo import PpoConfig
 from represent_jax.agents.registry import find_agent
 from represent_jax.agents.sac import PolicyParams, SacConfig
-from represent_jax.config import later, require
+from represent_jax.config import require
 from represent_jax.envs.episode import Episode
 from represent_jax.stages import discriminator
 from represent_jax.stages.discriminator import DiscriminatorConfig, DiscriminatorState, RewardParams
@@ -42,8 +42,6 @@ class AirlConfig:
       reward_clip: bound on f where it rewards the generator.
       policy_average_rate: share of the generator that enters the average handed on, after every
         training step; 1 hands on the last generator itself.
-      reward_average_rate: the same for the discriminator's parameters. While fewer training steps
-        than its inverse were made the average is their mean.
       discriminator: the discriminator.
       sac, ppo: the generators.
     """
@@ -55,7 +53,6 @@ class AirlConfig:
     reward_scale: float = 0.5
     reward_clip: float = 10.0
     policy_average_rate: float = 0.005
-    reward_average_rate: float = later(1.0)
     discriminator: DiscriminatorConfig = DiscriminatorConfig()
     sac: SacConfig = SacConfig(buffer_capacity=256_000, initial_temperature=0.1, learning_rate=1e-3)
     ppo: PpoConfig = PpoConfig()
@@ -64,9 +61,8 @@ class AirlConfig:
         require(self.env_steps >= 1, "env_steps", "at least 1", self.env_steps)
         find_agent(self.agent)
         require(self.cloning_updates >= 0, "cloning_updates", ">= 0", self.cloning_updates)
-        for field in ("policy_average_rate", "reward_average_rate"):
-            rate = getattr(self, field)
-            require(0.0 < rate <= 1.0, field, "in (0, 1]", rate)
+        rate = self.policy_average_rate
+        require(0.0 < rate <= 1.0, "policy_average_rate", "in (0, 1]", rate)
         # A clone is fitted before there are statistics, which would then move under its feet.
         require(
             not (self.cloning_updates and generator(self)[1].normalize_observations),
@@ -84,15 +80,11 @@ class AirlState:
       agent: the generator's.
       average: exponential average of the generator's networks.
       discriminator: the discriminator's.
-      reward_average: average of the discriminator's parameters.
-      steps: training steps made, `[]`.
     """
 
     agent: sac.SacState | ppo.PpoState
     average: Params
     discriminator: DiscriminatorState
-    reward_average: RewardParams
-    steps: jax.Array
 
 
 class AirlOutput(NamedTuple):
@@ -124,14 +116,11 @@ def init(key: jax.Array, env: Episode, demonstrations: Transition, config: AirlC
 
         policy = cloning.clone(key_clone, random, log_prob, demonstrations, config.cloning_updates)
     agent = module.init(key_agent, env, settings, start, policy)
-    judge = discriminator.init(key_discriminator, demonstrations, config.discriminator)
     return AirlState(
         agent=agent,
-        # Copies: the state is donated, and two leaves must not share one buffer.
+        # A copy: the state is donated, and two leaves must not share one buffer.
         average=jax.tree.map(jnp.copy, agent.learner.policy_params),
-        discriminator=judge,
-        reward_average=jax.tree.map(jnp.copy, judge.params),
-        steps=jnp.zeros((), jnp.int32),
+        discriminator=discriminator.init(key_discriminator, demonstrations, config.discriminator),
     )
 
 
@@ -147,9 +136,7 @@ def step(
     average = optax.incremental_update(
         agent.learner.policy_params, state.average, config.policy_average_rate
     )
-    rate = jnp.maximum(config.reward_average_rate, 1.0 / (state.steps + 1))
-    reward_average = optax.incremental_update(learned.params, state.reward_average, rate)
-    return AirlState(agent, average, learned, reward_average, state.steps + 1), metrics
+    return AirlState(agent, average, learned), metrics
 
 
 def _step_off_policy(state, env, demonstrations, config):
@@ -258,11 +245,10 @@ def reward(
 def finish(state: AirlState) -> AirlOutput:
     """Reads what the later phases need."""
     policy = PolicyParams(state.agent.learner.obs_stats, state.average)
-    return AirlOutput(policy, state.reward_average)
+    return AirlOutput(policy, state.discriminator.params)
 
 
 def population_axes(state: AirlState) -> AirlState:
     """Returns vmap axes for a stacked state: 0 everywhere but for the generator's counters."""
     module = sac if isinstance(state.agent, sac.SacState) else ppo
-    agent = module.population_axes(state.agent)
-    return AirlState(agent, average=0, discriminator=0, reward_average=0, steps=0)
+    return AirlState(module.population_axes(state.agent), average=0, discriminator=0)

@@ -20,7 +20,7 @@ import optax
 from brax.training import networks as brax_networks
 from flax import linen, struct
 
-from represent_jax.config import later, require
+from represent_jax.config import require
 from represent_jax.types import Metrics, Params, Transition
 
 # Bound on the inputs of g and h, in deviations of the demonstrations.
@@ -41,9 +41,6 @@ class DiscriminatorConfig:
       gradient_penalty: weight of the squared gradient norm of f between demonstration and policy.
       shaping_discount: gamma in f.
       log_prob_clip: bound on log pi in the logits.
-      importance_weights: whether rows acted under noise are weighted by how much less likely the
-        clean policy is to act so. Unweighted, what noise does is held against it from the lowest
-        level on.
     """
 
     state_only: bool = True
@@ -55,7 +52,6 @@ class DiscriminatorConfig:
     gradient_penalty: float = 1.0
     shaping_discount: float = 0.99
     log_prob_clip: float = 1.0
-    importance_weights: bool = later(True)
 
     def __post_init__(self) -> None:
         for field in ("batch_size", "updates_per_step"):
@@ -223,10 +219,8 @@ def loss(
     """
     f_expert, f_policy = (advantage(params, of, config) for of in (rows.expert, rows.policy))
     logits_expert_is_high, logits_policy = logits(f_expert, f_policy, rows)
-    weight = jnp.ones(())
-    if config.importance_weights:
-        action_dim = rows.policy.action_t.shape[-1]
-        weight = importance_weight(rows.log_prob_policy, rows.policy.noise_level_t, action_dim)
+    action_dim = rows.policy.action_t.shape[-1]
+    weight = importance_weight(rows.log_prob_policy, rows.policy.noise_level_t, action_dim)
     cross_entropy = 0.5 * jnp.mean(jax.nn.softplus(-logits_expert_is_high))
     cross_entropy += 0.5 * jnp.mean(weight * jax.nn.softplus(logits_policy))
     penalty = jnp.zeros(())

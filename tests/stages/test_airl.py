@@ -89,27 +89,6 @@ def test_the_policy_handed_on_is_the_average(problem):
     )
 
 
-def test_the_reward_handed_on_is_the_mean_over_training(problem):
-    config = dataclasses.replace(SMOKE.airl, reward_average_rate=1e-3)
-    demonstrations = transitions_of(problem.demonstrations)[0]
-    step = jax.jit(lambda state: airl.step(state, problem.env, demonstrations, config)[0])
-    state = jax.jit(lambda key: airl.init(key, problem.env, demonstrations, config))(
-        jax.random.PRNGKey(0)
-    )
-    seen = []
-    for _ in range(3):
-        state = step(state)
-        seen.append(state.discriminator.params)
-    expected = jax.tree.map(lambda *leaves: sum(leaves) / 3, *seen)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
-        airl.finish(state).reward,
-        expected,
-    )
-    first, last = (np.concatenate([x.ravel() for x in jax.tree.leaves(p.g)]) for p in seen[::2])
-    assert not np.allclose(first, last)
-
-
 def test_noise_levels_are_those_of_ssrr(problem):
     demonstrations = transitions_of(problem.demonstrations)[0]
     sac = dataclasses.replace(SMOKE.airl.sac, num_envs=10, buffer_capacity=400)
@@ -127,8 +106,6 @@ def test_bad_settings_are_named():
         airl.AirlConfig(agent="td3")
     with pytest.raises(UsageError, match="policy_average_rate"):
         airl.AirlConfig(policy_average_rate=0.0)
-    with pytest.raises(UsageError, match="reward_average_rate"):
-        airl.AirlConfig(reward_average_rate=1.5)
     normalizing = dataclasses.replace(SMOKE.airl.sac, normalize_observations=True)
     with pytest.raises(UsageError, match="normalize_observations"):
         airl.AirlConfig(sac=normalizing)
