@@ -112,7 +112,11 @@ _KITCHEN = (
     *(
         f"{stage}.sac.{setting}"
         for stage in (*_GENERATORS, "policies")
-        for setting in ("learn_temperature=false", "initial_temperature=0.05")
+        for setting in (
+            "learn_temperature=false",
+            "initial_temperature=0.05",
+            "prior_in_value=true",
+        )
     ),
 )
 
