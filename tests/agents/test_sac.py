@@ -258,26 +258,3 @@ def test_without_rewards_the_actor_returns_to_the_policy_it_started_from():
 def test_without_a_weight_no_prior_is_kept():
     first = sac.policy_of(sac.init_learner(KEY, ENV.observation_size, ENV.action_size, SMALL))
     assert sac.init(KEY, ENV, SMALL, policy_params=first).learner.prior is None
-
-
-def test_with_the_prior_in_their_value_critics_count_a_divergence_that_is_zero_at_the_prior():
-    shared = {"normalize_observations": False, "learn_temperature": False}
-    plain = dataclasses.replace(SMALL, **shared, initial_temperature=1e-9)
-    config = dataclasses.replace(SMALL, **shared, initial_temperature=0.3, prior_weight=0.3)
-    first = sac.policy_of(sac.init_learner(KEY, ENV.observation_size, ENV.action_size, plain))
-
-    def critic_loss(config):
-        state = sac.init(KEY, ENV, config, policy_params=first)
-        _, batches = sac.draw(state, ENV, config)
-        batch = jax.tree.map(lambda x: x[0], batches)
-        return float(
-            jax.jit(sac.update, static_argnums=3)(state.learner, batch, KEY, config)[1][
-                "critic_loss"
-            ]
-        )
-
-    without = critic_loss(plain)
-    np.testing.assert_allclose(
-        critic_loss(dataclasses.replace(config, prior_in_value=True)), without, rtol=1e-4
-    )
-    assert abs(critic_loss(config) - without) > 0.01 * without
