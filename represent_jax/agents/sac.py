@@ -20,7 +20,7 @@ from brax.training.agents.sac import networks as sac_networks
 from flax import struct
 
 from represent_jax.agents import replay
-from represent_jax.config import later, require
+from represent_jax.config import require
 from represent_jax.envs.episode import Episode, transition_of
 from represent_jax.types import Metrics, Params, RewardFn, Transition
 
@@ -46,9 +46,6 @@ class SacConfig:
       prior_weight: weight of staying near the policy it starts from: -log pi_1 of the actor's own
         actions in its loss (BRAC-p, https://arxiv.org/abs/1911.11361). Critics that know only
         pi_1's actions otherwise send the actor where they know nothing.
-      prior_in_value: whether critics count it too, of the actions to come (BRAC's value penalty).
-        Without it they count the entropy's term alone, and states in which the actor is undecided
-        are worth more than those in which it knows what to do.
       reward_scale: factor on the reward.
       normalize_observations: whether networks see observations in units of their running spread.
     """
@@ -66,7 +63,6 @@ class SacConfig:
     initial_temperature: float = 1.0
     learn_temperature: bool = True
     prior_weight: float = 0.0
-    prior_in_value: bool = later(False)
     reward_scale: float = 1.0
     normalize_observations: bool = False
 
@@ -345,18 +341,10 @@ def update(
     """Makes one gradient update of temperature, critics and actor from a batch `[batch_size]`."""
     networks = make_networks(batch.obs_t.shape[-1], batch.action_t.shape[-1], config)
     key_temperature, key_critic, key_actor = jax.random.split(key, 3)
-    reward_t = batch.reward_t
-    if learner.prior is not None and config.prior_in_value:
-        # With the critic's own key these are the actions that its loss draws.
-        log_prior = _log_prior(
-            learner.policy_params, learner, networks, batch.next_obs_t, key_critic
-        )
-        bonus = config.discount * batch.discount_t * config.prior_weight * log_prior
-        reward_t += bonus / config.reward_scale
     transitions = brax_types.Transition(
         observation=batch.obs_t,
         action=batch.action_t,
-        reward=reward_t,
+        reward=batch.reward_t,
         discount=batch.discount_t,
         next_observation=batch.next_obs_t,
         # The stored next observation is the true one, so a time limit needs no masking.
@@ -416,19 +404,14 @@ def _actor_loss(policy_params, learner, networks, temperature, transitions, key,
     )
     if learner.prior is None:
         return loss
-    log_prior = _log_prior(policy_params, learner, networks, transitions.observation, key)
-    return loss - config.prior_weight * jnp.mean(log_prior)
-
-
-def _log_prior(policy_params, learner, networks, obs_t, key):
-    """log pi_1 of actions drawn from the policy, `[batch_size]`."""
     policy_network = networks.sac.policy_network
     distribution = networks.sac.parametric_action_distribution
-    prior = learner.prior
+    obs_t, prior = transitions.observation, learner.prior
     logits = policy_network.apply(learner.obs_stats, policy_params, obs_t)
     unbounded_action_t = distribution.sample_no_postprocessing(logits, key)
     logits_prior = policy_network.apply(prior.obs_stats, prior.policy, obs_t)
-    return distribution.log_prob(logits_prior, unbounded_action_t)
+    log_prior = distribution.log_prob(logits_prior, unbounded_action_t)
+    return loss - config.prior_weight * jnp.mean(log_prior)
 
 
 def learn(state: SacState, batches: Transition, config: SacConfig) -> tuple[SacState, Metrics]:

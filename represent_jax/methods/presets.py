@@ -112,11 +112,7 @@ _KITCHEN = (
     *(
         f"{stage}.sac.{setting}"
         for stage in (*_GENERATORS, "policies")
-        for setting in (
-            "learn_temperature=false",
-            "initial_temperature=0.05",
-            "prior_in_value=true",
-        )
+        for setting in ("learn_temperature=false", "initial_temperature=0.05")
     ),
 )
 
