@@ -98,7 +98,6 @@ _KITCHEN = (
     *(f"{stage}.cloning_updates=5_000" for stage in _GENERATORS),
     *_GENTLE_IMITATION,
     "policies.sac.prior_weight=0.05",
-    "policies.center_on_start=true",
     # Most demonstrated steps touch nothing: a floor among them cuts the fall of the curve off.
     "curve.reward_floor=none",
     # R^0 sees the kettle alone: what holds its handle fails under any noise, so that all that

@@ -54,14 +54,14 @@ def first_stages(
     def roll_out(key, directory, first):
         return pipeline.run_noise(key, config, problem, first, directory)
 
-    def fit(key, directory, first, noisy):
-        return pipeline.fit_curves(config, problem, first, noisy)
+    def fit(key, directory, noisy):
+        return pipeline.fit_curves(config, noisy)
 
     return (
         Stage("airl", imitate, (), {"airl": config.airl, "population": config.population}),
         Stage("airl_evaluation", judge_imitation, ("airl",), reports=True),
         Stage("noise", roll_out, ("airl",), {"noise": config.noise}),
-        Stage("curve", fit, ("airl", "noise"), {"curve": config.curve}),
+        Stage("curve", fit, ("noise",), {"curve": config.curve}),
     )
 
 
@@ -95,13 +95,12 @@ def last_stages(
         key_start, key = jax.random.split(key)
         objectives = _objectives(config, problem.env, views(rewards))
         starts = _starts(key_start, config, problem.env, objectives, first, reward_fn)
-        centered = _centered(key_start, config, problem.env, objectives, starts, reward_fn)
         return policy_learning.run(
             key,
             config.policies,
             config.population,
             problem.env,
-            centered,
+            list(objectives.values()),
             reward_fn,
             starts,
             directory,
@@ -199,23 +198,3 @@ def _starts(
         )
 
     return [start_of(name, objective) for name, objective in objectives.items()]
-
-
-def _centered(
-    key: jax.Array,
-    config: RepresentConfig,
-    env: Episode,
-    objectives: dict[str, policies.Objective],
-    starts: Sequence[policies.PolicyParams],
-    reward_fn: RewardFn,
-) -> list[policies.Objective]:
-    """The objectives, each centred on the policy that it starts from where the settings say so."""
-    found = list(objectives.values())
-    if not config.policies.center_on_start:
-        return found
-
-    @jax.jit
-    def centered(objective, policy):
-        return policies.center_on(key, env, objective, policy, config.policies, reward_fn)
-
-    return [centered(*pair) for pair in zip(found, starts, strict=True)]

@@ -18,7 +18,7 @@ from represent_jax.agents import rollout as rollouts
 from represent_jax.agents.ppo import PpoConfig
 from represent_jax.agents.registry import find_agent
 from represent_jax.agents.sac import PolicyParams, SacConfig
-from represent_jax.config import later, require
+from represent_jax.config import require
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.envs.episode import Episode
 from represent_jax.types import Metrics, Params, RewardFn
@@ -36,8 +36,6 @@ class PoliciesConfig:
         "last".
       center: subtracted from rho at every step, unless episodes can end early: there a negative
         reward would pay for ending them.
-      center_on_start: whether to subtract what the policy it starts from earns a step instead,
-        where there is one.
       eval_env_steps: environment steps between two evaluations.
       eval_episodes: deterministic episodes of an evaluation.
       sac, ppo: the agents.
@@ -48,7 +46,6 @@ class PoliciesConfig:
     start: str = "phase1"
     keep: str = "best"
     center: float = 1.0
-    center_on_start: bool = later(False)
     eval_env_steps: int = 20_000
     eval_episodes: int = 5
     sac: SacConfig = SacConfig(
@@ -116,25 +113,6 @@ def make_objective(params: Params, scale: float, env: Episode, config: PoliciesC
     """Centres a reward, unless episodes can end early."""
     center = 0.0 if env.terminates else config.center
     return Objective(params, jnp.float32(scale), jnp.float32(center))
-
-
-def center_on(
-    key: jax.Array,
-    env: Episode,
-    objective: Objective,
-    policy: PolicyParams,
-    config: PoliciesConfig,
-    reward_fn: RewardFn,
-) -> Objective:
-    """Centres a reward on what `policy` earns a step, unless episodes can end early.
-
-    Critics start at about 0. Where the policy earns less, whatever it has never done looks better
-    than what it does, and it leaves the ground it was started from.
-    """
-    if env.terminates:
-        return objective
-    earned = evaluate(key, env, objective, policy, config, reward_fn).learned_return
-    return objective._replace(center=objective.scale * earned / env.horizon)
 
 
 def _maximised(reward_fn: RewardFn) -> RewardFn:
