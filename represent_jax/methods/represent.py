@@ -54,14 +54,14 @@ def first_stages(
     def roll_out(key, directory, first):
         return pipeline.run_noise(key, config, problem, first, directory)
 
-    def fit(key, directory, noisy):
-        return pipeline.fit_curves(config, noisy)
+    def fit(key, directory, first, noisy):
+        return pipeline.fit_curves(config, problem, first, noisy)
 
     return (
         Stage("airl", imitate, (), {"airl": config.airl, "population": config.population}),
         Stage("airl_evaluation", judge_imitation, ("airl",), reports=True),
         Stage("noise", roll_out, ("airl",), {"noise": config.noise}),
-        Stage("curve", fit, ("noise",), {"curve": config.curve}),
+        Stage("curve", fit, ("airl", "noise"), {"curve": config.curve}),
     )
 
 
