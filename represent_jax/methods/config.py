@@ -96,7 +96,7 @@ class MethodConfig:
         return ""
 
     def check_against(self, obs_dim: int) -> None:
-        """Refuses settings that observations of this size do not fit."""
+        """Raises a UsageError for settings that observations of this size do not fit."""
 
 
 @dataclasses.dataclass(frozen=True)
