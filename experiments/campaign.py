@@ -62,6 +62,7 @@ def main(argv: list[str]) -> None:
     if _DRY_RUN.value:
         for node in graph.nodes:
             print(f"{'done' if graph.is_done(node) else 'left':5} {node.hash} {node.name}")
+        _print_time(graph)
         return
     record(graph, every, records)
     started: dict[str, float] = {}
@@ -85,11 +86,22 @@ def main(argv: list[str]) -> None:
         graph.run(report, engine)
     bad = [node for node in graph.nodes if graph.states[node.hash] in (FAILED, BLOCKED)]
     print(f"{len(graph.nodes) - len(bad)} of {len(graph.nodes)} stages done; records: {records}")
+    _print_time(graph)
     if bad:
         failed = [
             f"{node.name} ({graph.errors[node.hash]})" for node in bad if node.hash in graph.errors
         ]
         raise RepresentError(f"{len(bad)} stages are not done; failed: {'; '.join(failed)}")
+
+
+def _print_time(graph: Graph) -> None:
+    """Prints where the time went: what stages of each kind took, the longest first."""
+    taken = graph.seconds_by_kind()
+    total = sum(map(sum, taken.values()))
+    print(f"stages done took {format_duration(total)} in all:")
+    for kind, seconds in sorted(taken.items(), key=lambda item: -sum(item[1])):
+        each = format_duration(sum(seconds) / len(seconds))
+        print(f"  {kind:<42} {len(seconds):>4} x {each:>12} = {format_duration(sum(seconds))}")
 
 
 def _engine(every: list[Entry]) -> contextlib.AbstractContextManager[Engine]:

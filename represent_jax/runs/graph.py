@@ -120,16 +120,21 @@ class Graph:
 
     def seconds_left(self) -> float | None:
         """What the nodes left will take, from those of their kind; None where none has run."""
-        taken: dict[str, list[float]] = {}
-        for node in self.nodes:
-            if self.states.get(node.hash) == DONE:
-                taken.setdefault(node.kind, []).append(self.seconds(node))
+        taken = self.seconds_by_kind()
         if any(node.kind not in taken for node in self.left):
             return None
         return sum(sum(taken[node.kind]) / len(taken[node.kind]) for node in self.left)
 
+    def seconds_by_kind(self) -> dict[str, list[float]]:
+        """What each node that is done took, under its kind."""
+        taken: dict[str, list[float]] = {}
+        for node in self.nodes:
+            if self.is_done(node):
+                taken.setdefault(node.kind, []).append(self.seconds(node))
+        return taken
+
     def seconds(self, node: Node) -> float:
-        """What a node that is done took, restarts counted in."""
+        """What a node that is done took; where it was resumed, in the process that ended it."""
         return json.loads(self._mark(node).read_text())["seconds"]
 
     def seconds_in_all(self, node: Node) -> float:

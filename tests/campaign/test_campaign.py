@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -87,8 +88,11 @@ def test_every_method_is_recorded_once(campaign):
 def test_a_finished_campaign_adds_nothing(campaign):
     out, _, _ = campaign
     before = _records(out)
-    assert ", 0 of them left" in _finish(_start(out))
+    output = _finish(_start(out))
+    assert ", 0 of them left" in output
     assert _records(out) == before
+    counts = re.findall(r"^  .+ (\d+) x .+ = .+$", output, flags=re.MULTILINE)
+    assert sum(map(int, counts)) == len(list(out.glob("*/done.json")))
 
 
 def test_tables_are_printed_from_its_records(campaign):
