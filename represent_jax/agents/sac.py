@@ -20,7 +20,7 @@ from brax.training.agents.sac import networks as sac_networks
 from flax import struct
 
 from represent_jax.agents import replay
-from represent_jax.config import require
+from represent_jax.config import later, require
 from represent_jax.envs.episode import Episode, transition_of
 from represent_jax.types import Metrics, Params, RewardFn, Transition
 
@@ -38,6 +38,8 @@ class SacConfig:
       critic_warmup_updates: first updates in which only the critics learn, so that an actor that
         was learned elsewhere is not undone by critics that know nothing yet.
       hidden_sizes: units of the hidden layers of actor and critics.
+      critic_layer_norm: whether critics normalise their hidden layers, which bounds what they say of
+        actions that nobody took (https://arxiv.org/abs/2302.02948).
       learning_rate: Adam's step size of actor, critics and temperature.
       discount: discount factor of an environment step.
       target_update_rate: share of the critics that enters the target critics at each update.
@@ -57,6 +59,7 @@ class SacConfig:
     warmup_env_steps: int = 6_400
     critic_warmup_updates: int = 0
     hidden_sizes: tuple[int, ...] = (128, 128)
+    critic_layer_norm: bool = later(False)
     learning_rate: float = 3e-4
     discount: float = 0.99
     target_update_rate: float = 0.005
@@ -171,6 +174,7 @@ def make_networks(obs_dim: int, action_dim: int, config: SacConfig) -> Networks:
             action_dim,
             preprocess_observations_fn=preprocess,
             hidden_layer_sizes=config.hidden_sizes,
+            q_network_layer_norm=config.critic_layer_norm,
         )
     losses = sac_losses.make_losses(networks, config.reward_scale, config.discount, action_dim)
     return Networks(networks, *losses, optax.adam(config.learning_rate))

@@ -258,3 +258,25 @@ def test_without_rewards_the_actor_returns_to_the_policy_it_started_from():
 def test_without_a_weight_no_prior_is_kept():
     first = sac.policy_of(sac.init_learner(KEY, ENV.observation_size, ENV.action_size, SMALL))
     assert sac.init(KEY, ENV, SMALL, policy_params=first).learner.prior is None
+
+
+def test_normalised_critics_are_bounded_however_far_the_action():
+    """A hidden layer of unit spread caps the value at sqrt(units) times the last layer's norm."""
+    far = jnp.full((1, 1), 1e6)
+
+    def values(config):
+        learner = sac.init_learner(KEY, 1, 1, config)
+        critic = sac.make_networks(1, 1, config).sac.q_network
+        said = critic.apply(learner.obs_stats, learner.q_params, jnp.zeros((1, 1)), far)
+        heads = jax.tree.leaves(
+            jax.tree.map(
+                lambda x: jnp.linalg.norm(x) if x.shape == (config.hidden_sizes[-1], 1) else None,
+                learner.q_params,
+            )
+        )
+        return np.abs(np.asarray(said)[0]), np.sqrt(config.hidden_sizes[-1]) * np.asarray(heads)
+
+    said, bound = values(dataclasses.replace(CONFIG, critic_layer_norm=True))
+    assert said.shape == bound.shape == (2,) and np.all(said <= bound * (1 + 1e-5))
+    said, bound = values(CONFIG)
+    assert np.all(said > bound)
