@@ -45,6 +45,8 @@ class SacConfig:
       target_update_rate: share of the critics that enters the target critics at each update.
       initial_temperature: the entropy's weight at the start.
       learn_temperature: whether the temperature follows the target entropy, -action_dim / 2.
+      critic_entropy: whether values count the policy's entropy beside rewards. Where the policy must
+        be narrow to do anything, that pays it for being where nothing has to be done.
       prior_weight: weight of staying near the policy it starts from: -log pi_1 of the actor's own
         actions in its loss (BRAC-p, https://arxiv.org/abs/1911.11361). Critics that know only
         pi_1's actions otherwise send the actor where they know nothing.
@@ -65,6 +67,7 @@ class SacConfig:
     target_update_rate: float = 0.005
     initial_temperature: float = 1.0
     learn_temperature: bool = True
+    critic_entropy: bool = later(True)
     prior_weight: float = 0.0
     reward_scale: float = 1.0
     normalize_observations: bool = False
@@ -360,7 +363,7 @@ def update(
         learner.policy_params,
         learner.obs_stats,
         learner.target_q_params,
-        temperature,
+        temperature if config.critic_entropy else jnp.zeros_like(temperature),
         transitions,
         key_critic,
     )

@@ -280,3 +280,18 @@ def test_normalised_critics_are_bounded_however_far_the_action():
     assert said.shape == bound.shape == (2,) and np.all(said <= bound * (1 + 1e-5))
     said, bound = values(CONFIG)
     assert np.all(said > bound)
+
+
+@pytest.mark.parametrize("counts", [True, False])
+def test_critics_count_the_entropy_only_where_they_should(counts):
+    config = dataclasses.replace(SMALL, critic_entropy=counts)
+    state = sac.init(KEY, ENV, config)
+    _, batches = sac.draw(state, ENV, config)
+    batch = jax.tree.map(lambda x: x[0], batches)
+
+    def critics(log_temperature):
+        learner = state.learner.replace(log_temperature=jnp.float32(log_temperature))
+        return jax.tree.leaves(sac.update(learner, batch, KEY, config)[0].q_params)
+
+    same = [np.array_equal(a, b) for a, b in zip(critics(-5.0), critics(0.0), strict=True)]
+    assert all(same) != counts
