@@ -35,6 +35,8 @@ class SacConfig:
       batch_size: transitions in each update.
       buffer_capacity: transitions kept, a multiple of `num_envs`.
       warmup_env_steps: environment steps taken before the first update.
+      staggered: whether first episodes are cut off after random times. Without it all environments
+        are at the same step of their episodes, which long episodes and a small budget never undo.
       critic_warmup_updates: first updates in which only the critics learn, so that an actor that
         was learned elsewhere is not undone by critics that know nothing yet.
       hidden_sizes: units of the hidden layers of actor and critics.
@@ -59,6 +61,7 @@ class SacConfig:
     batch_size: int = 256
     buffer_capacity: int = 512_000
     warmup_env_steps: int = 6_400
+    staggered: bool = later(False)
     critic_warmup_updates: int = 0
     hidden_sizes: tuple[int, ...] = (128, 128)
     critic_layer_norm: bool = later(False)
@@ -239,6 +242,10 @@ def init(
             learner = learner.replace(prior=jax.tree.map(jnp.copy, policy_params))
     if start is None:
         start = jax.vmap(env.reset)(jax.random.split(key_env, config.num_envs))
+    if config.staggered:
+        key_steps = jax.random.fold_in(key_env, 1)
+        steps = jax.random.randint(key_steps, (config.num_envs,), 0, env.horizon)
+        start = start.replace(info=start.info | {"steps": steps})
     buffer = replay.init(config.buffer_capacity, obs_dim, action_dim)
 
     def warm(carry, key):

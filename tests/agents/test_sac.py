@@ -295,3 +295,13 @@ def test_critics_count_the_entropy_only_where_they_should(counts):
 
     same = [np.array_equal(a, b) for a, b in zip(critics(-5.0), critics(0.0), strict=True)]
     assert all(same) != counts
+
+
+def test_staggered_episodes_end_at_different_times():
+    config = dataclasses.replace(SMALL, num_envs=64, buffer_capacity=640, warmup_env_steps=64)
+    together, apart = (
+        sac.init(KEY, ENV, dataclasses.replace(config, staggered=staggered)).env_state.info["steps"]
+        for staggered in (False, True)
+    )
+    assert np.all(np.asarray(together) == 1)
+    assert set(np.unique(apart)) == set(range(ENV.horizon))
