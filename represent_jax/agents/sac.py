@@ -40,15 +40,15 @@ class SacConfig:
       critic_warmup_updates: first updates in which only the critics learn, so that an actor that
         was learned elsewhere is not undone by critics that know nothing yet.
       hidden_sizes: units of the hidden layers of actor and critics.
-      critic_layer_norm: whether critics normalise their hidden layers, which bounds what they say of
-        actions that nobody took (https://arxiv.org/abs/2302.02948).
+      critic_layer_norm: whether critics normalise their hidden layers, which bounds what they say
+        of actions that nobody took (https://arxiv.org/abs/2302.02948).
       learning_rate: Adam's step size of actor, critics and temperature.
       discount: discount factor of an environment step.
       target_update_rate: share of the critics that enters the target critics at each update.
       initial_temperature: the entropy's weight at the start.
       learn_temperature: whether the temperature follows the target entropy, -action_dim / 2.
-      critic_entropy: whether values count the policy's entropy beside rewards. Where the policy must
-        be narrow to do anything, that pays it for being where nothing has to be done.
+      critic_entropy: whether values count the policy's entropy beside rewards. Where the policy
+        must be narrow to do anything, that pays it for being where nothing has to be done.
       prior_weight: weight of staying near the policy it starts from: -log pi_1 of the actor's own
         actions in its loss (BRAC-p, https://arxiv.org/abs/1911.11361). Critics that know only
         pi_1's actions otherwise send the actor where they know nothing.

@@ -106,13 +106,27 @@ _KITCHEN = (
     # R~^i sees so much more than R^0 that by itself it would explain the curve and leave to R^0
     # what is left over: at 0.1 R^0 orders noise levels backwards.
     "regression.lambda_reg=5",
-    # At the prior's weight entropy and prior are one term, weight * KL(pi || prior). Learned, the
-    # temperature rises to 300: what moves a kettle has far less entropy than SAC aims at.
     *(
         f"{stage}.sac.{setting}"
         for stage in (*_GENERATORS, "policies")
-        for setting in ("learn_temperature=false", "initial_temperature=0.05")
+        for setting in (
+            # At the prior's weight entropy and prior are one term, weight * KL(pi || prior).
+            # Learned, the temperature rises to 300: what moves a kettle has far less entropy than
+            # SAC aims at. Counted in values, that lack costs more than a step earns.
+            "learn_temperature=false",
+            "initial_temperature=0.05",
+            "critic_entropy=false",
+            # A budget is two episodes of each environment: at the same step of them, they would
+            # show a batch of starts, then a batch of ends.
+            "staggered=true",
+            # A step costs twenty of the others', so updates are what can be afforded, and critics
+            # that learn from each transition more often need a bound on what they extrapolate.
+            "critic_layer_norm=true",
+        )
     ),
+    *(f"{stage}.sac.updates_per_step=16" for stage in _GENERATORS),
+    "policies.sac.updates_per_step=32",
+    "policies.sac.critic_warmup_updates=4_000",
 )
 
 # A step of the kitchen costs twenty of the others'.
