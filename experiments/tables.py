@@ -2,12 +2,16 @@
 
 python -m experiments.tables --table=1
 python -m experiments.tables --table=2 --preset=quick --format=latex
+python -m experiments.tables --update=README.md
 """
+
+from pathlib import Path
 
 from absl import flags
 
 from experiments import launch
-from represent_jax.campaign import formats, tables
+from represent_jax.campaign import embedded, formats, tables
+from represent_jax.data.atomic import replacing
 from represent_jax.errors import UsageError
 from represent_jax.runs.records import read_records
 
@@ -15,6 +19,9 @@ _TABLE = flags.DEFINE_list("table", ["1"], f"Of {', '.join(tables.TABLES)}.")
 _RECORDS = flags.DEFINE_string("records", "results/records.jsonl", "File of records.")
 _PRESET = flags.DEFINE_string("preset", "paper", "Preset whose records to take.")
 _FORMAT = flags.DEFINE_string("format", "text", f"One of {', '.join(formats.FORMATS)}.")
+_UPDATE = flags.DEFINE_string(
+    "update", None, "Markdown page whose tables are written anew; its comments say which."
+)
 
 
 def main(argv: list[str]) -> None:
@@ -22,8 +29,24 @@ def main(argv: list[str]) -> None:
     records = read_records(_RECORDS.value)
     if not records:
         raise UsageError(f"{_RECORDS.value}: no records there")
+    if _UPDATE.value:
+        _update(Path(_UPDATE.value), records)
+        return
     shown = [tables.make(name, records, _PRESET.value) for name in _TABLE.value]
     print("\n\n".join(formats.render(_FORMAT.value, *one) for one in shown))
+
+
+def _update(page: Path, records: list[dict]) -> None:
+    if not page.is_file():
+        raise UsageError(f"--update: {page} is no file")
+    before = page.read_text()
+    after = embedded.update(before, records)
+    if after == before:
+        print(f"{page}: as the records have it")
+        return
+    with replacing(page) as temporary:
+        temporary.write_text(after)
+    print(f"{page}: tables written anew")
 
 
 if __name__ == "__main__":

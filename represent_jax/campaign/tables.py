@@ -286,22 +286,26 @@ def _to_grid(
     rows = {_row_name(cell) for cell in measured}
     cells = [*(cell for cell in demonstrated if _row_name(cell) in rows), *measured]
     methods = list(dict.fromkeys(cell.method for cell in cells))
+    most_seeds = max(cell.found.num for cell in measured)
     shown: dict[str, dict[str, str]] = {}
     for cell in cells:
         digits = _digits(cell)
         text = _plus_minus(cell.found.mean, cell.found.std, digits)
         if cell.paper:
             text += f" ({_plus_minus(*cell.paper, digits=digits)})"
+        if cell.found.num < most_seeds and cell.method != "demonstrators":
+            text += f" [{cell.found.num}]"
         shown.setdefault(_row_name(cell), {})[cell.method] = text
-    seeds = sorted({cell.found.num for cell in measured})
-    counted = f"{seeds[0]}" if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+    counted = f"{most_seeds} seed{'s' * (most_seeds > 1)}"
+    if any(cell.found.num < most_seeds for cell in measured):
+        counted += ", or as many as square brackets say"
     return Table(
         title=f"{title}: {_QUANTITY_NAMES[quantity]}",
         columns=("", *(METHOD_NAMES[method] for method in methods)),
         rows=tuple(
             (name, *(row.get(method, "-") for method in methods)) for name, row in shown.items()
         ),
-        note=f"Mean +- standard deviation over seeds ({counted}); in brackets the paper's.",
+        note=f"Mean +- standard deviation over {counted}; in round brackets the paper's.",
     )
 
 

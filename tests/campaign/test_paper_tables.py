@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from represent_jax.campaign import formats, paper, tables
+from represent_jax.campaign import embedded, formats, paper, tables
 from represent_jax.errors import RepresentError, UsageError
 
 
@@ -90,7 +90,44 @@ def test_grids_have_a_table_a_quantity_and_a_column_a_method():
     highest, kept = tables.to_grids(*tables.make("2", records, "quick"))
     assert highest.title.endswith("highest") and kept.title.endswith("kept")
     assert highest.columns == ("", "REPRESENT", "D-REX")
-    assert highest.rows == (("Hopper, task", "1,010 +- 10 (1,692)", "7 (1)"),)
+    assert highest.rows == (("Hopper, task", "1,010 +- 10 (1,692)", "7 (1) [1]"),)
     assert kept.columns == ("", "Demonstrators", "REPRESENT")
     assert kept.rows == (("Hopper, strategy 1", "4 (1,198)", "5"),)
-    assert "(1 to 3)" in highest.note and "(1)" in kept.note
+    assert "3 seeds, or" in highest.note and "over 1 seed;" in kept.note
+
+
+def test_grids_say_where_seeds_are_missing():
+    records = [_record("task", "return_final", seed, 1000.0) for seed in range(5)]
+    records += [_record("task", "return_final", seed, 900.0, method="ssrr") for seed in range(2)]
+    text = formats.render("grid", *tables.make("2", records, "quick"))
+    assert "| 1,000 ± 0 | 900 ± 0 [2] |" in text
+    assert "over 5 seeds, or as many as square brackets say" in text
+
+
+_BLOCK = """# Page
+<!-- tables: --table=2 --preset=quick --format=grid -->
+{}<!-- end of tables -->
+"""
+
+
+def test_tables_inside_a_page_are_written_anew_and_nothing_else_is():
+    records = [_record("task", "return_best", 0, 1000.0)]
+    page = embedded.update(_BLOCK.format("what stood here before\n") + "after", records)
+    assert page.startswith("# Page\n") and page.endswith("after") and "| 1,000 (1,692) |" in page
+    assert "what stood here" not in page
+    assert embedded.update(page, records) == page
+
+
+@pytest.mark.parametrize(
+    ("page", "error"),
+    [
+        ("no block", "no block of tables"),
+        ("<!-- tables: --table=2 -->\n", "does not end"),
+        (_BLOCK.format("").replace("--table", "--tabel"), "expected --table"),
+        (_BLOCK.format("").replace("=2", "=9"), "unknown table"),
+        (_BLOCK.format("").replace("grid", "gird"), "unknown format"),
+    ],
+)
+def test_blocks_that_cannot_be_filled_are_errors(page, error):
+    with pytest.raises(RepresentError, match=error):
+        embedded.update(page, [_record("task", "return_best", 0, 1000.0)])

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import represent_jax as rj
+from represent_jax.campaign import embedded
 from represent_jax.envs import registry
+from represent_jax.runs.records import read_records
 
 DOCS = blocks.ROOT / "docs"
 
@@ -75,6 +77,11 @@ def test_readme(folder):
     found = run_page(blocks.ROOT / "README.md", folder, given | {"obs": rows.obs})
     assert found["r"].shape == (rows.length,)
     assert np.isfinite(found["r"]).all() and found["action"].shape == (rows.length + 1, 6)
+
+
+def test_tables_in_readme_are_those_of_the_records():
+    page = (blocks.ROOT / "README.md").read_text()
+    assert embedded.update(page, read_records(blocks.ROOT / "results" / "records.jsonl")) == page
 
 
 @pytest.mark.parametrize(
