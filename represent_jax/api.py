@@ -150,7 +150,8 @@ def load_policy(
       target: "task", or "strategy_1" and so on.
 
     Returns:
-      `policy(obs) -> action`, deterministic, for observations `[..., obs_dim]`.
+      `policy(obs) -> action`, a pure function of observations `[..., obs_dim]`. Where policies are
+      to sample (`policies.actions`), the noise is drawn from the observation's own bits.
 
     Raises:
       RepresentError: the run has not trained its policies, or they carry a hidden state.

@@ -226,7 +226,7 @@ def run_regression(
         init,
         train,
         data,
-        lambda state: state.rewards,
+        lambda state: regression.finish(state, data, config.regression),
         config.regression.num_updates,
         directory,
         checkpoint_seconds,
@@ -253,7 +253,7 @@ def run_regressions(
         return regression.init(key, *sizes, config.regression)
 
     if directory.is_done("regression"):
-        example = jax.eval_shape(init, key, members[0]).rewards
+        example = regression.example(*sizes, config.regression)
         example = jax.tree.map(lambda x: shape_like(x, num_strategies), example)
         return directory.load_output("regression", example)
     population = Population(members, config.population)
@@ -271,7 +271,12 @@ def run_regressions(
         checkpoint_seconds=checkpoint_seconds,
         describe=lambda m: "loss " + numbers(m["ssrr_loss"]),
     )
-    output = stack([state.rewards for state in population.members(states)])
+    output = stack(
+        [
+            regression.finish(state, member, config.regression)
+            for state, member in zip(population.members(states), members, strict=True)
+        ]
+    )
     directory.save_output("regression", output)
     return output
 

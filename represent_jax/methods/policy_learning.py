@@ -113,10 +113,9 @@ def best_start(
 def load(
     config: MethodConfig, env: Environment, directory: RunDirectory
 ) -> dict[str, Callable[[jax.Array], jax.Array]]:
-    """The policies of a run of any method that has `policies`, by target; they take modes."""
-    agent, settings = policies.agent_of(config.policies)
+    """The policies of a run of any method that has `policies`, by target."""
     names = config.policy_names
-    key, action_dim = jax.random.PRNGKey(0), env.action_size
+    key = jax.random.PRNGKey(0)
     example = jax.eval_shape(lambda key: _random_policy(key, env, config.policies), key)
     stacked = directory.load_output(
         "policies", jax.tree.map(lambda x: shape_like(x, len(names)), example)
@@ -124,8 +123,7 @@ def load(
 
     def policy_of(i):
         params = jax.tree.map(lambda x: x[i], stacked)
-        # The key is not used: actions are modes.
-        return lambda obs: agent.act(params, obs, key, settings, action_dim, deterministic=True)
+        return lambda obs: policies.act(params, obs, env.action_size, config.policies)
 
     return {name: policy_of(i) for i, name in enumerate(names)}
 

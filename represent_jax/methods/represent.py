@@ -142,10 +142,8 @@ def load_rewards(
 ) -> dict[str, Callable[..., jax.Array]]:
     """R^0 and every R^i of a run, by target."""
     sizes = (env.observation_size, env.action_size, config.num_groups)
-    example = jax.eval_shape(
-        lambda key: regression.init(key, *sizes, config.regression), jax.random.PRNGKey(0)
-    )
-    return rewards_of(config, directory.load_output("regression", example.rewards))
+    example = regression.example(*sizes, config.regression)
+    return rewards_of(config, directory.load_output("regression", example))
 
 
 def _views(config: RepresentConfig, rewards: regression.Rewards) -> dict[str, regression.View]:

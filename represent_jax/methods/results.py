@@ -29,7 +29,7 @@ FINAL_EPISODES = 10
 # From trajectories to what a reward makes of them, `[num_trajectories]`.
 LearnedReturns = Callable[[TrajectoryBatch], jax.Array]
 
-# From a key to `FINAL_EPISODES` deterministic episodes of a policy.
+# From a key to `FINAL_EPISODES` episodes of a policy.
 Episodes = Callable[[jax.Array], TrajectoryBatch]
 
 

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from represent_jax.config import require
 from represent_jax.envs import Environment
@@ -86,9 +85,9 @@ def load_rewards(
 ) -> dict[str, Callable[..., jax.Array]]:
     """Every reward of a run, by target."""
     sizes = (env.observation_size, env.action_size, 1)
-    keys = jnp.zeros((config.num_groups, 2), jnp.uint32)
-    example = jax.eval_shape(
-        jax.vmap(lambda key: regression.init(key, *sizes, config.regression).rewards), keys
+    example = jax.tree.map(
+        lambda x: pipeline.shape_like(x, config.num_groups),
+        regression.example(*sizes, config.regression),
     )
     return _rewards_of(config, directory.load_output("regression", example))
 

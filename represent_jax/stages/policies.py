@@ -18,7 +18,7 @@ from represent_jax.agents import rollout as rollouts
 from represent_jax.agents.ppo import PpoConfig
 from represent_jax.agents.registry import find_agent
 from represent_jax.agents.sac import PolicyParams, SacConfig
-from represent_jax.config import require
+from represent_jax.config import later, require
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.envs.episode import Episode
 from represent_jax.types import Metrics, Params, RewardFn
@@ -37,7 +37,10 @@ class PoliciesConfig:
       center: subtracted from rho at every step, unless episodes can end early: there a negative
         reward would pay for ending them.
       eval_env_steps: environment steps between two evaluations.
-      eval_episodes: deterministic episodes of an evaluation.
+      eval_episodes: episodes of an evaluation.
+      actions: what policies do where they are evaluated, and once they are handed on: the "mode" of
+        their actions, or "sampled" ones, as while learning. A narrow path is learned with its
+        noise, and the mode may leave it.
       sac, ppo: the agents.
     """
 
@@ -48,6 +51,7 @@ class PoliciesConfig:
     center: float = 1.0
     eval_env_steps: int = 20_000
     eval_episodes: int = 5
+    actions: str = later("mode")
     sac: SacConfig = SacConfig(
         initial_temperature=0.05,
         learning_rate=1e-3,
@@ -60,6 +64,7 @@ class PoliciesConfig:
         find_agent(self.agent)
         require(self.start in ("phase1", "cold"), "start", "'phase1' or 'cold'", self.start)
         require(self.keep in ("best", "last"), "keep", "'best' or 'last'", self.keep)
+        require(self.actions in ("mode", "sampled"), "actions", "'mode' or 'sampled'", self.actions)
         for field in ("env_steps", "eval_env_steps", "eval_episodes"):
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
 
@@ -98,7 +103,7 @@ class PolicyState:
 
 
 class Evaluation(NamedTuple):
-    """Deterministic episodes of a policy.
+    """Episodes of a policy.
 
     Attributes:
       true_return: mean return under the environment's reward, `[]`.
@@ -206,10 +211,35 @@ def evaluate(
     config: PoliciesConfig,
     reward_fn: RewardFn,
 ) -> Evaluation:
-    """Runs deterministic episodes; the true return is only ever reported, never used."""
+    """Runs episodes; the true return is only ever reported, never used."""
     batch = rollout(key, env, policy, config.eval_episodes, config)
     learned = rollouts.learned_returns(batch, reward_fn, objective.params)
     return Evaluation(jnp.mean(rollouts.true_returns(batch)), jnp.mean(learned))
+
+
+def act(
+    policy: PolicyParams, obs_t: jax.Array, action_dim: int, config: PoliciesConfig
+) -> jax.Array:
+    """What a policy does where it is used, a pure function of observations, `[..., action_dim]`.
+
+    Noise of sampled actions is drawn from the observation's own bits: as good as any other, for no
+    two observations are the same, and equal observations get equal actions.
+    """
+    agent, settings = agent_of(config)
+    if config.actions == "mode":
+        # The key is not used.
+        key = jax.random.PRNGKey(0)
+        return agent.act(policy, obs_t, key, settings, action_dim, deterministic=True)
+
+    def one(obs_t):
+        bits = jax.lax.bitcast_convert_type(obs_t.astype(jnp.float32), jnp.uint32)
+        key, _ = jax.lax.scan(
+            lambda key, word: (jax.random.fold_in(key, word), None), jax.random.PRNGKey(0), bits
+        )
+        return agent.act(policy, obs_t, key, settings, action_dim)
+
+    flat = jnp.reshape(obs_t, (-1, obs_t.shape[-1]))
+    return jax.vmap(one)(flat).reshape(*obs_t.shape[:-1], action_dim)
 
 
 def rollout(
@@ -219,11 +249,12 @@ def rollout(
     num_episodes: int,
     config: PoliciesConfig,
 ) -> TrajectoryBatch:
-    """Runs deterministic episodes of the agent's policy, `[num_episodes]`."""
+    """Runs episodes of the agent's policy, `[num_episodes]`."""
     whole = Episode(env.env, env.horizon, auto_reset=False)
     agent, settings = agent_of(config)
+    mode = config.actions == "mode"
 
     def act(params, obs_t, key):
-        return agent.act(params, obs_t, key, settings, env.action_size, deterministic=True)
+        return agent.act(params, obs_t, key, settings, env.action_size, deterministic=mode)
 
     return rollouts.rollout(whole, act, policy, key, jnp.zeros(num_episodes))

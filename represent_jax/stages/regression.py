@@ -64,6 +64,9 @@ class RegressionConfig:
       include_action: whether rewards see state and action as well as the next state.
       task_entries: entries of the next observation that R^0 sees, such as the objects that a task
         is about; everything that a R~^i sees if empty.
+      input_quantile: rewards see no input beyond this quantile of the noisy rollouts, nor below
+        its counterpart: what lies outside counts as being at the edge, so that nothing is paid for
+        going on where nobody has been. Not bounded if none.
     """
 
     num_updates: int = 3000
@@ -87,6 +90,7 @@ class RegressionConfig:
     discrimination_ratio: float = 0.7
     include_action: bool = False
     task_entries: tuple[int, ...] = later(())
+    input_quantile: float | None = later(None)
 
     def __post_init__(self) -> None:
         for field in ("num_updates", "num_snippets", "ensemble_size", "min_snippet_steps"):
@@ -122,6 +126,20 @@ class RegressionConfig:
             "indices from 0",
             self.task_entries,
         )
+        if self.input_quantile is not None:
+            require(
+                0.5 < self.input_quantile <= 1.0,
+                "input_quantile",
+                "in (0.5, 1], or none",
+                self.input_quantile,
+            )
+
+
+class Bounds(NamedTuple):
+    """What of an input rewards see: nothing below `low` and nothing above `high`, `[input_dim]`."""
+
+    low: jax.Array
+    high: jax.Array
 
 
 class Rewards(NamedTuple):
@@ -130,10 +148,13 @@ class Rewards(NamedTuple):
     Attributes:
       task: R^0, leaves `[ensemble, ...]`.
       strategies: R~^1 to R~^M, leaves `[ensemble, num_strategies, ...]`.
+      bounds: of their inputs; None without, and while they are fitted, since within the data they
+        change next to nothing.
     """
 
     task: Params
     strategies: Params
+    bounds: Bounds | None = None
 
 
 class RegressionData(NamedTuple):
@@ -216,6 +237,31 @@ def init(
     strategies = jax.vmap(jax.vmap(lambda key: draw(key, input_dim)))(keys)
     rewards = Rewards(task, strategies)
     return RegressionState(rewards, _optimizer(config).init(rewards), key)
+
+
+def finish(state: RegressionState, data: RegressionData, config: RegressionConfig) -> Rewards:
+    """Reads the rewards, with the bounds of their inputs where there are to be any."""
+    if config.input_quantile is None:
+        return state.rewards
+    noisy = data.noisy
+    inputs = inputs_of(noisy.obs[..., :-1, :], noisy.actions, noisy.obs[..., 1:, :], config)
+    rows = jnp.where(noisy.mask[..., None] > 0, inputs, jnp.nan).reshape(-1, inputs.shape[-1])
+    levels = jnp.array([1.0 - config.input_quantile, config.input_quantile])
+    return state.rewards._replace(bounds=Bounds(*jnp.nanquantile(rows, levels, axis=0)))
+
+
+def example(
+    obs_dim: int, action_dim: int, num_strategies: int, config: RegressionConfig
+) -> Rewards:
+    """The shapes of what `finish` returns, for a checkpoint to be read into."""
+    sizes = (obs_dim, action_dim, num_strategies)
+    key = jax.random.PRNGKey(0)
+    rewards = jax.eval_shape(lambda key: init(key, *sizes, config), key).rewards
+    if config.input_quantile is None:
+        return rewards
+    input_dim = obs_dim + (obs_dim + action_dim if config.include_action else 0)
+    edge = jax.ShapeDtypeStruct((input_dim,), jnp.float32)
+    return rewards._replace(bounds=Bounds(edge, edge))
 
 
 def inputs_of(
@@ -424,18 +470,20 @@ class View(NamedTuple):
     Attributes:
       task, own: parameters of R^0 and of one R~^i, leaves `[ensemble, ...]`.
       strategy_weight: 0 for R^0, alpha_i for R^i, `[]`.
+      bounds: of the inputs.
     """
 
     task: Params
     own: Params
     strategy_weight: jax.Array
+    bounds: Bounds | None = None
 
 
 def view(rewards: Rewards, strategy: int | None, config: RegressionConfig) -> View:
     """Picks R^0 (`strategy=None`) or R^i (counted from 0)."""
     own = jax.tree.map(lambda leaf: leaf[:, strategy or 0], rewards.strategies)
     weight = 0.0 if strategy is None else config.strategy_weight
-    return View(rewards.task, own, jnp.float32(weight))
+    return View(rewards.task, own, jnp.float32(weight), rewards.bounds)
 
 
 def view_reward(
@@ -447,6 +495,8 @@ def view_reward(
 ) -> jax.Array:
     """R^0 or R^i, `[...]`."""
     inputs = inputs_of(obs_t, action_t, next_obs_t, config)
+    if view.bounds is not None:
+        inputs = jnp.clip(inputs, *view.bounds)
     task = head_reward(view.task, task_inputs_of(inputs, config), config)
     return task + view.strategy_weight * head_reward(view.own, inputs, config)
 

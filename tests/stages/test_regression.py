@@ -137,6 +137,27 @@ def test_task_entries_outside_the_observation_are_refused():
         dataclasses.replace(CONFIG, task_entries=(-1,))
 
 
+def test_bounded_rewards_pay_nothing_for_going_beyond_what_was_rolled_out():
+    config = dataclasses.replace(CONFIG, input_quantile=1.0)
+    noisy = _batch(np.random.default_rng(0).normal(size=(3, 21, 2)), lengths=[19, 19, 19])
+    # Past the end of an episode nothing was rolled out.
+    noisy = jax.tree.map(lambda x: x[None], noisy._replace(obs=noisy.obs.at[:, -1].set(1e6)))
+    data = RegressionData(noisy, jnp.ones((1, 3)), noisy)
+    state = regression.init(jax.random.PRNGKey(1), 2, 1, 1, config)
+    rewards = regression.finish(state, data, config)
+    reached = noisy.obs[:, :, 1:-1].reshape(-1, 2)
+    np.testing.assert_allclose(rewards.bounds.high, reached.max(axis=0))
+    np.testing.assert_allclose(rewards.bounds.low, reached.min(axis=0))
+    for edge, beyond in ((rewards.bounds.high, 5.0), (rewards.bounds.low, -5.0)):
+        for strategy in (None, 0):
+            there = regression.reward(rewards, None, None, edge, config, strategy)
+            farther = regression.reward(rewards, None, None, edge + beyond, config, strategy)
+            np.testing.assert_array_equal(farther, there)
+    assert jax.tree.map(jnp.shape, rewards) == jax.tree.map(
+        jnp.shape, regression.example(2, 1, 1, config)
+    )
+
+
 def test_known_reward_is_recovered_and_decomposed():
     """Two strategies in different places; the curve knows a shared feature, x, and nothing else."""
     key = jax.random.PRNGKey(0)
