@@ -84,16 +84,26 @@ def apply_overrides(config: C, overrides: Sequence[str]) -> C:
     return from_dict(type(config), values)
 
 
-def later(default: Any) -> Any:
-    """A field that came after results were kept: at its default it leaves `identity` as it was."""
-    return dataclasses.field(default=default, metadata={"later": True})
+_SAME = object()
+
+
+def later(default: Any, before: Any = _SAME) -> Any:
+    """A field that came after results were kept: at what was before, `identity` is as it was.
+
+    Args:
+      default: the field's default.
+      before: the value that does what was done before the field existed; the default if not given.
+    """
+    return dataclasses.field(
+        default=default, metadata={"before": default if before is _SAME else before}
+    )
 
 
 def identity(values: Mapping[str, Any]) -> dict[str, Any]:
     """Returns what tells settings apart: a mapping that may hold configurations, as `to_dict`.
 
-    Fields made by `later` are left out at their default, so that results kept before the field
-    existed are found again.
+    Fields made by `later` are left out at the value that does what was done before them, so that
+    results kept before the field existed are found again.
     """
     return {name: _identity(value) for name, value in values.items()}
 
@@ -126,7 +136,7 @@ def _identity(value: Any) -> Any:
     return {
         field.name: _identity(one)
         for field, one in held.items()
-        if not (field.metadata.get("later") and one == field.default)
+        if not ("before" in field.metadata and one == field.metadata["before"])
     }
 
 

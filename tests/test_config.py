@@ -132,18 +132,21 @@ def test_hash_tells_configurations_apart_and_takes_dictionaries():
 @dataclasses.dataclass(frozen=True)
 class Grown(Optimizer):
     entries: tuple[int, ...] = config.later(())
+    better: bool = config.later(True, before=False)
 
 
-def test_identity_is_kept_by_a_later_field_at_its_default_alone():
+def test_identity_is_kept_by_a_later_field_at_what_was_before_alone():
     before = config.identity({"seed": 1, "each": Optimizer(), "sizes": (2, 3)})
     assert before == {
         "seed": 1,
         "each": {"learning_rate": 3e-4, "decay": None},
         "sizes": [2, 3],
     }
-    assert config.identity({"seed": 1, "each": Grown(), "sizes": (2, 3)}) == before
+    as_before = Grown(better=False)
+    assert config.identity({"seed": 1, "each": as_before, "sizes": (2, 3)}) == before
     changed = config.identity({"each": {"inner": Grown(entries=(4,))}})
     assert changed["each"]["inner"]["entries"] == [4]
+    assert changed["each"]["inner"]["better"] is True
     assert config.to_dict(Grown())["entries"] == []
 
 

@@ -31,6 +31,7 @@ METHOD_NAMES = {
     "no_reg": "without L_reg",
     "no_bcd": "without L_BCD",
     "shared": "R^0 alone",
+    "equal_units": "curves in one unit",
     "no_sigmoid": "without the sigmoid",
     "ensemble_1": "ensemble of one",
     "literal_bcd": "Eq. 5 literally",

@@ -68,6 +68,7 @@ VARIANTS = {
     "shared": Variant("shared", "represent", ("regression.strategy_weight=0",)),
     "ensemble_1": Variant("ensemble_1", "represent", ("regression.ensemble_size=1",)),
     "literal_bcd": Variant("literal_bcd", "represent", ("regression.discrimination=literal",)),
+    "equal_units": Variant("equal_units", "represent", ("regression.learn_units=false",)),
     "no_sigmoid": Variant("no_sigmoid", "represent", ("curve.targets=returns",)),
     "airl": Variant("airl", "represent", ("airl.noisy=false",)),
     "cold": Variant("cold", "represent", ("policies.start=cold",)),
@@ -89,7 +90,10 @@ VARIANTS = {
     },
 }
 
-ABLATIONS = ("no_reg", "no_bcd", "shared", "no_sigmoid", "ensemble_1", "literal_bcd")
+ABLATIONS = (
+    *("no_reg", "no_bcd", "shared", "equal_units"),
+    *("no_sigmoid", "ensemble_1", "literal_bcd"),
+)
 
 _REWARDS, _POLICIES = "reward_evaluation", "policy_evaluation"
 _DECOMPOSING = ("represent", "ssrr", "ssrr_separate", "msrd", "drex")

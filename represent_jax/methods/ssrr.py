@@ -20,7 +20,13 @@ from represent_jax.runs import RunDirectory
 from represent_jax.stages import regression
 from represent_jax.stages.regression import RegressionConfig
 
-_SINGLE = RegressionConfig(strategy_weight=0.0, lambda_reg=0.0, lambda_bcd=0.0)
+# What is left of Phase 3 where there is one reward; a single curve has no unit to learn.
+_NOTHING_ELSE = {
+    "strategy_weight": 0.0,
+    "lambda_reg": 0.0,
+    "lambda_bcd": 0.0,
+    "learn_units": False,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,13 +35,14 @@ class SsrrConfig(RepresentConfig):
 
     method: str = "ssrr"
     grouping: str = "merged"
-    regression: RegressionConfig = _SINGLE
+    regression: RegressionConfig = RegressionConfig(**_NOTHING_ELSE)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for field in ("strategy_weight", "lambda_reg", "lambda_bcd"):
+        for field, nothing in _NOTHING_ELSE.items():
             found = getattr(self.regression, field)
-            require(found == 0.0, f"regression.{field}", "0, SSRR decomposes nothing", found)
+            expected = f"{nothing}, SSRR decomposes nothing"
+            require(found == nothing, f"regression.{field}", expected, found)
 
     @property
     def target_names(self) -> tuple[str, ...]:
@@ -46,8 +53,7 @@ class SsrrConfig(RepresentConfig):
 def configure(settings: dict[str, Any]) -> dict[str, Any]:
     """Turns the settings of a preset and a domain into SSRR's."""
     own = settings["regression"]
-    own = dataclasses.replace(own, strategy_weight=0.0, lambda_reg=0.0, lambda_bcd=0.0)
-    return settings | {"regression": own}
+    return settings | {"regression": dataclasses.replace(own, **_NOTHING_ELSE)}
 
 
 def plan(

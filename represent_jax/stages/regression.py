@@ -26,6 +26,9 @@ from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.stages.mlp import Mlp, squared_kernels
 from represent_jax.types import Metrics, Params
 
+# Adam moves every parameter by about its step size; a unit has to get farther than a weight.
+_UNIT_SPEED = 10.0
+
 
 class Discrimination(enum.StrEnum):
     """How Eq. 5 is read; u_i(m) is the mean of rho^i over a demonstration of strategy m.
@@ -67,6 +70,9 @@ class RegressionConfig:
       input_quantile: rewards see no input beyond this quantile of the noisy rollouts, nor below
         its counterpart: what lies outside counts as being at the edge, so that nothing is paid for
         going on where nobody has been. Not bounded if none.
+      learn_units: whether each strategy's curve has a unit of its own, learned with the rewards.
+        Scaled to [0, 1] by themselves, curves say that all strategies are equally good without
+        noise; R^0, which sees them all, then has to call the better one's rollouts too bad.
     """
 
     num_updates: int = 3000
@@ -91,6 +97,7 @@ class RegressionConfig:
     include_action: bool = False
     task_entries: tuple[int, ...] = later(())
     input_quantile: float | None = later(None)
+    learn_units: bool = later(True, before=False)
 
     def __post_init__(self) -> None:
         for field in ("num_updates", "num_snippets", "ensemble_size", "min_snippet_steps"):
@@ -173,9 +180,17 @@ class RegressionData(NamedTuple):
 
 @struct.dataclass
 class RegressionState:
-    """Training state: parameters, optimiser and key."""
+    """Training state.
+
+    Attributes:
+      rewards: parameters.
+      log_units: of the curves, `[ensemble, num_strategies]`, see `units_of`; None where they are 1.
+      opt: the optimiser's.
+      key: PRNG key.
+    """
 
     rewards: Rewards
+    log_units: jax.Array | None
     opt: optax.OptState
     key: jax.Array
 
@@ -236,7 +251,8 @@ def init(
     keys = jax.random.split(key_strategies, shape)
     strategies = jax.vmap(jax.vmap(lambda key: draw(key, input_dim)))(keys)
     rewards = Rewards(task, strategies)
-    return RegressionState(rewards, _optimizer(config).init(rewards), key)
+    log_units = jnp.zeros(shape) if config.learn_units else None
+    return RegressionState(rewards, log_units, _optimizer(config).init((rewards, log_units)), key)
 
 
 def finish(state: RegressionState, data: RegressionData, config: RegressionConfig) -> Rewards:
@@ -314,6 +330,12 @@ def sample_snippets(
     return Snippets(inputs, length / horizon, targets[index[:, 0]])
 
 
+def units_of(log_units: jax.Array) -> jax.Array:
+    """What a curve value of 1 is worth, `[..., num_strategies]`: positive, of geometric mean 1."""
+    log_units = _UNIT_SPEED * log_units
+    return jnp.exp(log_units - jnp.mean(log_units, axis=-1, keepdims=True))
+
+
 def ssrr_loss(rho: jax.Array, snippets: Snippets, return_scale: float) -> jax.Array:
     """Eq. 3 on snippets: (sum_t R(s_t) - S sigma L / T)^2, estimated without bias.
 
@@ -354,6 +376,7 @@ def discrimination_loss(utility: jax.Array, config: RegressionConfig) -> jax.Arr
 
 def loss(
     rewards: Rewards,
+    log_units: jax.Array | None,
     snippets: Snippets,
     demonstration_inputs: jax.Array,
     horizon: int,
@@ -363,6 +386,7 @@ def loss(
 
     Args:
       rewards: without the ensemble axis.
+      log_units: of the curves, `[num_strategies]`; None where they are 1.
       snippets: `[num_strategies, ...]`.
       demonstration_inputs: states of demonstrations, `[num_strategies, states, input_dim]`.
       horizon: T.
@@ -374,9 +398,10 @@ def loss(
     rho_task = unit * head.apply(rewards.task, task_inputs_of(snippets.inputs, config))
     rho_own = unit * jax.vmap(head.apply)(rewards.strategies, snippets.inputs)
     alpha = config.strategy_weight
-    ssrr = jax.vmap(ssrr_loss, in_axes=(0, 0, None))(
-        rho_task + alpha * rho_own, snippets, config.return_scale
-    )
+    units = jnp.ones(num_strategies) if log_units is None else units_of(log_units)
+    # In its own unit, so that no strategy's errors get small by its unit getting so.
+    rho = (rho_task + alpha * rho_own) / units[:, None, None]
+    ssrr = jax.vmap(ssrr_loss, in_axes=(0, 0, None))(rho, snippets, config.return_scale)
     # Every strategy's head on every strategy's demonstrations, [i, m, states].
     flat = demonstration_inputs.reshape(-1, input_dim)
     rho_cross = unit * jax.vmap(head.apply, in_axes=(0, None))(rewards.strategies, flat)
@@ -402,6 +427,7 @@ def loss(
         "l2_loss": l2,
         "strategy_reward_own": jnp.mean(own),
         "strategy_reward_others": others / jnp.maximum(num_strategies * (num_strategies - 1), 1),
+        "largest_unit": jnp.max(units),
     }
     return total, metrics
 
@@ -426,7 +452,7 @@ def step(
     key_members, key = jax.random.split(state.key)
     num_strategies, _, horizon = data.noisy.mask.shape
 
-    def member_loss(rewards, key):
+    def member_loss(learned, key):
         key_snippets, key_states = jax.random.split(key)
         snippets = jax.vmap(sample_snippets, in_axes=(0, 0, 0, None))(
             jax.random.split(key_snippets, num_strategies), data.noisy, data.targets, config
@@ -434,13 +460,14 @@ def step(
         states = jax.vmap(_sample_states, in_axes=(0, 0, None))(
             jax.random.split(key_states, num_strategies), data.demonstrations, config
         )
-        return loss(rewards, snippets, states, horizon, config)
+        return loss(*learned, snippets, states, horizon, config)
 
     keys = jax.random.split(key_members, config.ensemble_size)
-    grads, metrics = jax.vmap(jax.grad(member_loss, has_aux=True))(state.rewards, keys)
+    learned = (state.rewards, state.log_units)
+    grads, metrics = jax.vmap(jax.grad(member_loss, has_aux=True))(learned, keys)
     updates, opt = _optimizer(config).update(grads, state.opt)
-    rewards = optax.apply_updates(state.rewards, updates)
-    return RegressionState(rewards, opt, key), jax.tree.map(jnp.mean, metrics)
+    learned = optax.apply_updates(learned, updates)
+    return RegressionState(*learned, opt, key), jax.tree.map(jnp.mean, metrics)
 
 
 def train(

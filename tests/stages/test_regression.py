@@ -182,6 +182,33 @@ def test_known_reward_is_recovered_and_decomposed():
         assert float(evaluation.pearson(unseen[:, 0], learned)) > 0.9
 
 
+def test_units_are_positive_and_their_geometric_mean_is_one():
+    units = regression.units_of(jnp.array([[0.3, -0.1, 0.05], [0.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(jnp.prod(units, axis=-1), 1.0, rtol=1e-5)
+    np.testing.assert_array_equal(units[1], 1.0)
+    assert (units > 0.0).all() and (jnp.diff(units[0]) != 0.0).all()
+
+
+def test_a_strategy_that_is_twice_as_good_gets_twice_the_unit():
+    """Each curve runs from 0 to 1 by itself; where both went, they contradict each other."""
+    config = dataclasses.replace(CONFIG, num_updates=800, lambda_reg=1.0)
+    key, horizon, num = jax.random.PRNGKey(0), 40, 60
+    levels = jnp.linspace(1.0, 0.0, num)
+    data = []
+    for strategy, best in enumerate((1.0, 2.0)):
+        noise = 0.1 * jax.random.normal(jax.random.fold_in(key, strategy), (num, horizon + 1, 2))
+        centre = jnp.stack([best * levels, jnp.zeros(num)], axis=-1)
+        data.append(_batch(centre[:, None] + noise))
+    noisy = jax.tree.map(lambda *x: jnp.stack(x), *data)
+    problem = RegressionData(noisy, jnp.stack([levels, levels]), noisy)
+    state = regression.init(jax.random.PRNGKey(1), 2, 1, 2, config)
+    train = jax.jit(lambda state: regression.train(state, problem, config, config.num_updates)[0])
+    first, second = np.mean(regression.units_of(train(state).log_units), axis=0)
+    assert second / first == pytest.approx(2.0, rel=0.15)
+    apart = dataclasses.replace(config, learn_units=False)
+    assert regression.init(jax.random.PRNGKey(1), 2, 1, 2, apart).log_units is None
+
+
 def test_step_is_the_same_without_jit():
     obs = np.random.default_rng(0).normal(size=(1, 3, 21, 2))
     noisy = jax.tree.map(lambda x: x[None], _batch(obs[0]))
