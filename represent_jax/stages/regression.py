@@ -427,8 +427,9 @@ def loss(
         "l2_loss": l2,
         "strategy_reward_own": jnp.mean(own),
         "strategy_reward_others": others / jnp.maximum(num_strategies * (num_strategies - 1), 1),
-        "largest_unit": jnp.max(units),
     }
+    if log_units is not None:
+        metrics |= {f"unit_{i + 1}": units[i] for i in range(num_strategies)}
     return total, metrics
 
 
