@@ -219,6 +219,10 @@ def _optimizer(config: RegressionConfig) -> optax.GradientTransformation:
     return optax.adam(config.learning_rate)
 
 
+def _input_dim(obs_dim: int, action_dim: int, config: RegressionConfig) -> int:
+    return obs_dim + (obs_dim + action_dim if config.include_action else 0)
+
+
 def check_entries(config: RegressionConfig, obs_dim: int) -> None:
     """Raises a UsageError where R^0 is to see entries that an observation does not have."""
     require(
@@ -239,7 +243,7 @@ def init(
     """
     check_entries(config, obs_dim)
     key_task, key_strategies, key = jax.random.split(key, 3)
-    input_dim = obs_dim + (obs_dim + action_dim if config.include_action else 0)
+    input_dim = _input_dim(obs_dim, action_dim, config)
     head = _head(config)
 
     def draw(key, input_dim):
@@ -275,7 +279,7 @@ def example(
     rewards = jax.eval_shape(lambda key: init(key, *sizes, config), key).rewards
     if config.input_quantile is None:
         return rewards
-    input_dim = obs_dim + (obs_dim + action_dim if config.include_action else 0)
+    input_dim = _input_dim(obs_dim, action_dim, config)
     edge = jax.ShapeDtypeStruct((input_dim,), jnp.float32)
     return rewards._replace(bounds=Bounds(edge, edge))
 
