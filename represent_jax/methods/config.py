@@ -13,6 +13,7 @@ from represent_jax.stages.curve import CurveConfig
 from represent_jax.stages.noise import NoiseConfig
 from represent_jax.stages.policies import PoliciesConfig
 from represent_jax.stages.regression import RegressionConfig
+from represent_jax.stages.selection import SelectionConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +119,8 @@ class RepresentConfig(MethodConfig):
 
     Attributes:
       policy_targets: targets that a policy is trained for; all if empty.
-      airl, noise, curve, regression, policies: settings of the stages.
+      airl, noise, curve, regression, policies, selection: settings of the stages; SSRR has no
+        selection.
     """
 
     policy_targets: tuple[str, ...] = ()
@@ -127,6 +129,7 @@ class RepresentConfig(MethodConfig):
     curve: CurveConfig = CurveConfig()
     regression: RegressionConfig = RegressionConfig()
     policies: PoliciesConfig = PoliciesConfig()
+    selection: SelectionConfig = SelectionConfig()
 
     def __post_init__(self) -> None:
         super().__post_init__()

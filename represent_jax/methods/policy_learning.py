@@ -1,11 +1,13 @@
-"""Policies on learned rewards, all targets as one population on a run directory."""
+"""Policies on learned rewards, all targets as one population on a run directory, and selection."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from represent_jax.agents import rollout as rollouts
 from represent_jax.agents.sac import PolicyParams
 from represent_jax.envs import Environment, Episode
 from represent_jax.methods.config import MethodConfig
@@ -13,9 +15,23 @@ from represent_jax.methods.pipeline import numbers, shape_like
 from represent_jax.methods.population import Population, stack
 from represent_jax.runs import RunDirectory
 from represent_jax.runs.loop import advance
-from represent_jax.stages import policies
+from represent_jax.stages import policies, selection
 from represent_jax.stages.policies import PoliciesConfig
 from represent_jax.types import RewardFn
+
+
+class Selected(NamedTuple):
+    """What a selection hands on.
+
+    Attributes:
+      policies: leaves `[num_objectives, ...]`, in the order of the objectives.
+      chosen: the objective each was trained on, `[num_objectives]`.
+      learned_returns: of every trained policy (rows) under every reward (columns).
+    """
+
+    policies: PolicyParams
+    chosen: jax.Array
+    learned_returns: jax.Array
 
 
 class Trained(NamedTuple):
@@ -23,11 +39,13 @@ class Trained(NamedTuple):
 
     Attributes:
       policies: leaves `[num_objectives, ...]`, in the order of the objectives.
-      log: what was logged at every evaluation.
+      log: what was logged at every evaluation of the policy trained on each.
+      selected: how they were selected; None where each objective has its own.
     """
 
     policies: PolicyParams
     log: list[dict[str, Any]]
+    selected: Selected | None = None
 
     def policy(self, i: int) -> PolicyParams:
         """Returns the policy of objective i."""
@@ -93,6 +111,41 @@ def run(
     return Trained(output, directory.read_log("policies"))
 
 
+def select(
+    key: jax.Array,
+    config: PoliciesConfig,
+    margins: Sequence[float],
+    env: Episode,
+    objectives: Sequence[policies.Objective],
+    reward_fn: RewardFn,
+    trained: Trained,
+    directory: RunDirectory,
+) -> Trained:
+    """Hands every objective its own policy or a better one of another's, see `stages.selection`.
+
+    Args:
+      key: PRNG key.
+      config: settings of the policies.
+      margins: of every objective, as `selection.choose` takes them.
+      env: episodes to judge in.
+      objectives: what was maximised.
+      reward_fn: the reward whose parameters the objectives hold.
+      trained: the policies, of the objectives in their order.
+      directory: where the stage is saved, and restored from.
+    """
+    if directory.is_done("selection"):
+        example = _selected_like(trained.policies, len(objectives))
+        selected = directory.load_output("selection", example)
+    else:
+        candidates = [trained.policy(i) for i in range(len(objectives))]
+        returns = learned_returns(key, env, objectives, candidates, config, reward_fn)
+        chosen = selection.choose(returns, jnp.asarray(margins))
+        handed_on = jax.tree.map(lambda x: x[chosen], trained.policies)
+        selected = Selected(handed_on, chosen, returns)
+        directory.save_output("selection", selected)
+    return Trained(selected.policies, trained.log, selected)
+
+
 def best_start(
     key: jax.Array,
     env: Episode,
@@ -102,24 +155,44 @@ def best_start(
     reward_fn: RewardFn,
 ) -> PolicyParams:
     """The policy with the highest learned return."""
-    score = jax.jit(
-        lambda policy: (
-            policies.evaluate(key, env, objective, policy, config, reward_fn).learned_return
-        )
-    )
-    return starts[int(np.argmax([float(score(policy)) for policy in starts]))]
+    returns = learned_returns(key, env, [objective], starts, config, reward_fn)
+    return starts[int(np.argmax(returns[:, 0]))]
+
+
+def learned_returns(
+    key: jax.Array,
+    env: Episode,
+    objectives: Sequence[policies.Objective],
+    candidates: Sequence[PolicyParams],
+    config: PoliciesConfig,
+    reward_fn: RewardFn,
+) -> jax.Array:
+    """Mean learned return of policies in the same episodes, `[num_policies, num_objectives]`."""
+    rewards = stack([objective.params for objective in objectives])
+
+    @jax.jit
+    def judge(policy):
+        batch = policies.rollout(key, env, policy, config.eval_episodes, config)
+        return jax.vmap(
+            lambda params: jnp.mean(rollouts.learned_returns(batch, reward_fn, params))
+        )(rewards)
+
+    return jnp.stack([judge(policy) for policy in candidates])
 
 
 def load(
     config: MethodConfig, env: Environment, directory: RunDirectory
 ) -> dict[str, Callable[[jax.Array], jax.Array]]:
-    """The policies of a run of any method that has `policies`, by target."""
+    """The policies that a run of any method with `policies` hands on, by target."""
     names = config.policy_names
     key = jax.random.PRNGKey(0)
     example = jax.eval_shape(lambda key: _random_policy(key, env, config.policies), key)
-    stacked = directory.load_output(
-        "policies", jax.tree.map(lambda x: shape_like(x, len(names)), example)
-    )
+    example = jax.tree.map(lambda x: shape_like(x, len(names)), example)
+    if directory.is_done("selection"):
+        example = _selected_like(example, len(names))
+        stacked = directory.load_output("selection", example).policies
+    else:
+        stacked = directory.load_output("policies", example)
 
     def policy_of(i):
         params = jax.tree.map(lambda x: x[i], stacked)
@@ -133,3 +206,13 @@ def _random_policy(
 ) -> PolicyParams:
     agent, settings = policies.agent_of(config)
     return agent.policy_of(agent.init_learner(key, env.observation_size, env.action_size, settings))
+
+
+def _selected_like(policies_like: PolicyParams, num_objectives: int) -> Selected:
+    """Shapes and types of a selection's output."""
+    shape = (num_objectives,)
+    return Selected(
+        jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), policies_like),
+        jax.ShapeDtypeStruct(shape, jnp.int32),
+        jax.ShapeDtypeStruct(shape * 2, jnp.float32),
+    )

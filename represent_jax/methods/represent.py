@@ -1,6 +1,7 @@
 """REPRESENT (Xue, Chen, Gombolay; RA-L 2025), Algorithm 1, as a plan of stages.
 
-demonstrations -> airl -> noise -> curve -> regression -> policies, each judged as it ends
+demonstrations -> airl -> noise -> curve -> regression -> policies -> selection, each judged as it
+ends
 """
 
 from collections.abc import Callable, Sequence
@@ -36,6 +37,7 @@ def plan(
             checkpoint_seconds,
             views=lambda rewards: _views(config, rewards),
             rewards_of=lambda rewards: rewards_of(config, rewards),
+            select=True,
         ),
     )
 
@@ -71,6 +73,7 @@ def last_stages(
     checkpoint_seconds: float,
     views: Callable[[regression.Rewards], dict[str, regression.View]],
     rewards_of: Callable[[regression.Rewards], dict[str, Callable[..., jax.Array]]],
+    select: bool = False,
 ) -> tuple[Stage, ...]:
     """What follows a regression: its rewards judged, policies on them, and these judged.
 
@@ -80,6 +83,7 @@ def last_stages(
       checkpoint_seconds: least time between two checkpoints.
       views: from what the regression returned to its rewards, by target, as parameters.
       rewards_of: the same as functions `reward(obs_t, action_t, next_obs_t)`.
+      select: whether a target may be handed another's policy, see `stages.selection`.
     """
     reward_fn = _reward_fn(config)
 
@@ -107,22 +111,45 @@ def last_stages(
             checkpoint_seconds,
         )
 
+    def hand_on(key, directory, rewards, trained) -> Trained:
+        objectives = _objectives(config, problem.env, views(rewards))
+        # The task has no style of its own to lose.
+        margins = [
+            config.selection.margin if name in config.group_names else 0.0 for name in objectives
+        ]
+        return policy_learning.select(
+            key,
+            config.policies,
+            margins,
+            problem.env,
+            list(objectives.values()),
+            reward_fn,
+            trained,
+            directory,
+        )
+
     def judge_policies(key, directory, rewards, trained):
         episodes = results.agents_episodes(
             config.policies, problem.env, config.policy_names, trained
         )
         learned = results.learned_returns(rewards_of(rewards))
-        return results.judge_policies(
+        found = results.judge_policies(
             key, config, problem, episodes, learned, trained.log, directory
         )
+        return found | results.describe_selection(config, trained)
 
     settings = {"policies": config.policies, "population": config.population}
     if config.policy_names != config.target_names:
         settings["policy_targets"] = config.policy_names
+    selection, handed_on = (), "policies"
+    if select:
+        inputs, handed_on = ("regression", "policies"), "selection"
+        selection = (Stage("selection", hand_on, inputs, {"selection": config.selection}),)
     return (
         Stage("reward_evaluation", judge_rewards, ("noise", "curve", "regression"), reports=True),
         Stage("policies", train, ("airl", "regression"), settings),
-        Stage("policy_evaluation", judge_policies, ("regression", "policies"), reports=True),
+        *selection,
+        Stage("policy_evaluation", judge_policies, ("regression", handed_on), reports=True),
     )
 
 

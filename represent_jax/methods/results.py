@@ -275,6 +275,23 @@ def judge_policies(
     return {"policies": results}
 
 
+def describe_selection(config: MethodConfig, trained: Trained) -> dict[str, Any]:
+    """Whose policy every target is handed, and what all policies earn of all rewards, if any."""
+    if trained.selected is None:
+        return {}
+    names = config.policy_names
+    returns = np.asarray(trained.selected.learned_returns)
+    return {
+        "selection": {
+            name: {
+                "trained_for": names[int(trained.selected.chosen[i])],
+                "learned_returns": dict(zip(names, returns[:, i].tolist(), strict=True)),
+            }
+            for i, name in enumerate(names)
+        }
+    }
+
+
 def _env_steps_to(
     share: float, log: Sequence[Mapping[str, Any]], true_returns: Sequence[float]
 ) -> int | None:

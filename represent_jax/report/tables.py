@@ -104,13 +104,26 @@ def returns_table(results: Mapping[str, Any]) -> Table | None:
             "style",
         ),
         rows=tuple(rows),
-        note="Mean episode return under the environment's own reward, which the method never sees, "
+        note=_handed_on(results)
+        + "Mean episode return under the environment's own reward, which the method never sees, "
         "of the demonstrators (the task's are all of them), of their imitation, and of the policy "
         "trained on the learned reward: the one kept for its learned return, and the best met "
         "along the way. Vs demos: kept over demonstrators. Learned: the kept policy's return under "
         "the learned reward, in its own units. Style: share of states in which a strategy's policy "
         "is still recognised as that strategy.",
     )
+
+
+def _handed_on(results: Mapping[str, Any]) -> str:
+    """Which targets have another's policy, in a sentence; empty where none has."""
+    selection = results.get("selection") or {}
+    others = {
+        name: display_name(found["trained_for"]).lower()
+        for name, found in selection.items()
+        if found["trained_for"] != name
+    }
+    shown = ", ".join(f"{display_name(name)} has that of {of}" for name, of in others.items())
+    return f"Another's policy earns more of its reward than its own: {shown}. " if shown else ""
 
 
 def rewards_table(results: Mapping[str, Any]) -> Table | None:

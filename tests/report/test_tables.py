@@ -74,6 +74,14 @@ def test_summary_of_a_run_that_is_under_way(results):
     assert "Task" in summary(results)
 
 
+def test_a_policy_of_another_target_is_named(results):
+    found = {"trained_for": "strategy_2", "learned_returns": {}}
+    own = {"trained_for": "strategy_2", "learned_returns": {}}
+    results["selection"] = {"strategy_1": found, "strategy_2": own}
+    note = tables.returns_table(results).note
+    assert "Strategy 1 has that of strategy 2" in note and "Strategy 2 has" not in note
+
+
 def test_levels_of_the_demonstrators(results):
     assert demonstrator_levels(results)["task"] == (1400.0, 1600.0)
     assert demonstrator_levels(results)["strategy_1"] == (1200.0, 1600.0)
