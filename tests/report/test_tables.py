@@ -6,6 +6,7 @@ import pytest
 from represent_jax.report.tables import (
     Table,
     demonstrator_levels,
+    returns_table,
     rewards_table,
     summary,
     to_text,
@@ -78,7 +79,7 @@ def test_a_policy_of_another_target_is_named(results):
     found = {"trained_for": "strategy_2", "learned_returns": {}}
     own = {"trained_for": "strategy_2", "learned_returns": {}}
     results["selection"] = {"strategy_1": found, "strategy_2": own}
-    note = tables.returns_table(results).note
+    note = returns_table(results).note
     assert "Strategy 1 has that of strategy 2" in note and "Strategy 2 has" not in note
 
 
