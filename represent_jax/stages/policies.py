@@ -32,8 +32,8 @@ class PoliciesConfig:
       env_steps: budget of each target.
       agent: "sac" or "ppo".
       start: "phase1" starts from Phase 1's policy, "cold" from random networks.
-      keep: which policy is handed on: of those evaluated the "best" by learned return, or the
-        "last".
+      keep: which policy is handed on: of those evaluated the "best" by learned return, Phase 1's
+        among them where it is the start, or the "last".
       center: subtracted from rho at every step, unless episodes can end early: there a negative
         reward would pay for ending them.
       eval_env_steps: environment steps between two evaluations.
@@ -93,7 +93,7 @@ class PolicyState:
 
     Attributes:
       agent: the agent's.
-      best: the policy with the highest learned return of those evaluated.
+      best: the policy with the highest learned return of those evaluated, Phase 1's included.
       best_learned_return: `[]`.
     """
 
@@ -157,7 +157,11 @@ def init(
     )
     # A copy: the state is donated, and two leaves must not share one buffer.
     best = jax.tree.map(jnp.copy, agent.policy_of(state.learner))
-    return PolicyState(state, best, jnp.float32(-jnp.inf))
+    to_beat = jnp.float32(-jnp.inf)
+    if config.start == "phase1":
+        key_eval = jax.random.fold_in(key, 0)
+        to_beat = evaluate(key_eval, env, objective, best, config, reward_fn).learned_return
+    return PolicyState(state, best, to_beat)
 
 
 def train(

@@ -70,6 +70,9 @@ class RegressionConfig:
       input_quantile: rewards see no input beyond this quantile of the noisy rollouts, nor below
         its counterpart: what lies outside counts as being at the edge, so that nothing is paid for
         going on where nobody has been. Not bounded if none.
+      task_within_demonstrations: whether R^0 falls where what it sees is beyond all that was
+        demonstrated, as steeply as it rises within. More was better in all that was rolled out;
+        only demonstrations tell where to stop.
       learn_units: whether each strategy's curve has a unit of its own, learned with the rewards.
         Scaled to [0, 1] by themselves, curves say that all strategies are equally good without
         noise; R^0, which sees them all, then has to call the better one's rollouts too bad.
@@ -97,6 +100,7 @@ class RegressionConfig:
     include_action: bool = False
     task_entries: tuple[int, ...] = later(())
     input_quantile: float | None = later(None)
+    task_within_demonstrations: bool = later(False)
     learn_units: bool = later(True, before=False)
 
     def __post_init__(self) -> None:
@@ -149,6 +153,21 @@ class Bounds(NamedTuple):
     high: jax.Array
 
 
+class TaskRange(NamedTuple):
+    """Where R^0 is as fitted, and how it falls outside.
+
+    Attributes:
+      low, high: of what R^0 sees, in the demonstrations, `[task_input_dim]`.
+      slope: what it loses for a unit of distance from there, `[]`: `most` over the largest width.
+      most: the most that it loses, `[]`: what it differs by between demonstrated states.
+    """
+
+    low: jax.Array
+    high: jax.Array
+    slope: jax.Array
+    most: jax.Array
+
+
 class Rewards(NamedTuple):
     """Parameters of all rewards.
 
@@ -157,11 +176,13 @@ class Rewards(NamedTuple):
       strategies: R~^1 to R~^M, leaves `[ensemble, num_strategies, ...]`.
       bounds: of their inputs; None without, and while they are fitted, since within the data they
         change next to nothing.
+      task_range: of R^0; None without, and while they are fitted.
     """
 
     task: Params
     strategies: Params
     bounds: Bounds | None = None
+    task_range: TaskRange | None = None
 
 
 class RegressionData(NamedTuple):
@@ -260,14 +281,31 @@ def init(
 
 
 def finish(state: RegressionState, data: RegressionData, config: RegressionConfig) -> Rewards:
-    """Reads the rewards, with the bounds of their inputs where there are to be any."""
-    if config.input_quantile is None:
-        return state.rewards
-    noisy = data.noisy
-    inputs = inputs_of(noisy.obs[..., :-1, :], noisy.actions, noisy.obs[..., 1:, :], config)
-    rows = jnp.where(noisy.mask[..., None] > 0, inputs, jnp.nan).reshape(-1, inputs.shape[-1])
-    levels = jnp.array([1.0 - config.input_quantile, config.input_quantile])
-    return state.rewards._replace(bounds=Bounds(*jnp.nanquantile(rows, levels, axis=0)))
+    """Reads the rewards, with the bounds of their inputs and R^0's range where there are to be."""
+    rewards = state.rewards
+    if config.input_quantile is not None:
+        levels = jnp.array([1.0 - config.input_quantile, config.input_quantile])
+        edges = jnp.nanquantile(_rows_of(data.noisy, config), levels, axis=0)
+        rewards = rewards._replace(bounds=Bounds(*edges))
+    if config.task_within_demonstrations:
+        rewards = rewards._replace(task_range=_task_range(rewards, data, config))
+    return rewards
+
+
+def _rows_of(batch: TrajectoryBatch, config: RegressionConfig) -> jax.Array:
+    """Inputs of all steps, `[rows, input_dim]`; NaN where an episode was over."""
+    inputs = inputs_of(batch.obs[..., :-1, :], batch.actions, batch.obs[..., 1:, :], config)
+    return jnp.where(batch.mask[..., None] > 0, inputs, jnp.nan).reshape(-1, inputs.shape[-1])
+
+
+def _task_range(rewards: Rewards, data: RegressionData, config: RegressionConfig) -> TaskRange:
+    rows = _rows_of(data.demonstrations, config)
+    seen = rows if rewards.bounds is None else jnp.clip(rows, *rewards.bounds)
+    earned = head_reward(rewards.task, task_inputs_of(seen, config), config)
+    most = jnp.nanmax(earned) - jnp.nanmin(earned)
+    rows = task_inputs_of(rows, config)
+    low, high = jnp.nanmin(rows, axis=0), jnp.nanmax(rows, axis=0)
+    return TaskRange(low, high, most / jnp.max(high - low), most)
 
 
 def example(
@@ -277,11 +315,15 @@ def example(
     sizes = (obs_dim, action_dim, num_strategies)
     key = jax.random.PRNGKey(0)
     rewards = jax.eval_shape(lambda key: init(key, *sizes, config), key).rewards
-    if config.input_quantile is None:
-        return rewards
     input_dim = _input_dim(obs_dim, action_dim, config)
-    edge = jax.ShapeDtypeStruct((input_dim,), jnp.float32)
-    return rewards._replace(bounds=Bounds(edge, edge))
+    if config.input_quantile is not None:
+        edge = jax.ShapeDtypeStruct((input_dim,), jnp.float32)
+        rewards = rewards._replace(bounds=Bounds(edge, edge))
+    if config.task_within_demonstrations:
+        edge = jax.ShapeDtypeStruct((len(config.task_entries) or input_dim,), jnp.float32)
+        number = jax.ShapeDtypeStruct((), jnp.float32)
+        rewards = rewards._replace(task_range=TaskRange(edge, edge, number, number))
+    return rewards
 
 
 def inputs_of(
@@ -503,19 +545,21 @@ class View(NamedTuple):
       task, own: parameters of R^0 and of one R~^i, leaves `[ensemble, ...]`.
       strategy_weight: 0 for R^0, alpha_i for R^i, `[]`.
       bounds: of the inputs.
+      task_range: of R^0.
     """
 
     task: Params
     own: Params
     strategy_weight: jax.Array
     bounds: Bounds | None = None
+    task_range: TaskRange | None = None
 
 
 def view(rewards: Rewards, strategy: int | None, config: RegressionConfig) -> View:
     """Picks R^0 (`strategy=None`) or R^i (counted from 0)."""
     own = jax.tree.map(lambda leaf: leaf[:, strategy or 0], rewards.strategies)
     weight = 0.0 if strategy is None else config.strategy_weight
-    return View(rewards.task, own, jnp.float32(weight), rewards.bounds)
+    return View(rewards.task, own, jnp.float32(weight), rewards.bounds, rewards.task_range)
 
 
 def view_reward(
@@ -527,9 +571,15 @@ def view_reward(
 ) -> jax.Array:
     """R^0 or R^i, `[...]`."""
     inputs = inputs_of(obs_t, action_t, next_obs_t, config)
+    fall = 0.0
+    if view.task_range is not None:
+        low, high, slope, most = view.task_range
+        reached = task_inputs_of(inputs, config)
+        distance = jnp.linalg.norm(reached - jnp.clip(reached, low, high), axis=-1)
+        fall = jnp.minimum(slope * distance, most)
     if view.bounds is not None:
         inputs = jnp.clip(inputs, *view.bounds)
-    task = head_reward(view.task, task_inputs_of(inputs, config), config)
+    task = head_reward(view.task, task_inputs_of(inputs, config), config) - fall
     return task + view.strategy_weight * head_reward(view.own, inputs, config)
 
 

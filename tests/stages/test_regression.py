@@ -158,6 +158,43 @@ def test_bounded_rewards_pay_nothing_for_going_beyond_what_was_rolled_out():
     )
 
 
+@pytest.mark.parametrize("quantile", [None, 1.0])
+def test_the_task_reward_falls_beyond_what_was_demonstrated(quantile):
+    config = dataclasses.replace(
+        CONFIG, task_entries=(0, 2), task_within_demonstrations=True, input_quantile=quantile
+    )
+    random = np.random.default_rng(0)
+    noisy = _batch(random.uniform(-3.0, 3.0, size=(3, 21, 3)))
+    demonstrations = _batch(random.uniform(-1.0, 1.0, size=(2, 21, 3)) * [1.0, 1.0, 0.5])
+    noisy, alone = (jax.tree.map(lambda x: x[None], one) for one in (noisy, demonstrations))
+    data = RegressionData(noisy, jnp.ones((1, 3)), alone)
+    state = regression.init(jax.random.PRNGKey(1), 3, 1, 1, config)
+    rewards = regression.finish(state, data, config)
+    fitted = rewards._replace(task_range=None)
+    states = demonstrations.obs[:, 1:].reshape(-1, 3)
+    low, high = states.min(axis=0), states.max(axis=0)
+
+    def fall(obs, strategy=None):
+        before = regression.reward(fitted, None, None, obs, config, strategy)
+        return before - regression.reward(rewards, None, None, obs, config, strategy)
+
+    np.testing.assert_array_equal(fall(states), 0.0)
+    earned = regression.reward(fitted, None, None, states, config)
+    most = earned.max() - earned.min()
+    width = (high - low)[0]
+    edge = jnp.array([high[0], 0.0, 0.0])
+    for share in (0.25, 0.5):
+        beyond = edge + jnp.array([share * width, 0.0, 0.0])
+        np.testing.assert_allclose(fall(beyond), share * most, rtol=1e-3)
+        np.testing.assert_allclose(fall(beyond, 0), share * most, rtol=1e-3)
+    np.testing.assert_allclose(fall(edge + 50.0), most, rtol=1e-3)
+    # What is not of the task may go where it will.
+    np.testing.assert_array_equal(fall(jnp.array([0.0, 50.0, 0.0])), 0.0)
+    assert jax.tree.map(jnp.shape, rewards) == jax.tree.map(
+        jnp.shape, regression.example(3, 1, 1, config)
+    )
+
+
 def test_known_reward_is_recovered_and_decomposed():
     """Two strategies in different places; the curve knows a shared feature, x, and nothing else."""
     key = jax.random.PRNGKey(0)
