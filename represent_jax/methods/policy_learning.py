@@ -1,13 +1,11 @@
 """Policies on learned rewards, all targets as one population on a run directory, and selection."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from represent_jax.agents import rollout as rollouts
 from represent_jax.agents.sac import PolicyParams
 from represent_jax.envs import Environment, Episode
 from represent_jax.methods.config import MethodConfig
@@ -15,7 +13,7 @@ from represent_jax.methods.pipeline import numbers, shape_like
 from represent_jax.methods.population import Population, stack
 from represent_jax.runs import RunDirectory
 from represent_jax.runs.loop import advance
-from represent_jax.stages import policies, selection
+from represent_jax.stages import policies
 from represent_jax.stages.policies import PoliciesConfig
 from represent_jax.types import RewardFn
 
@@ -26,7 +24,7 @@ class Selected(NamedTuple):
     Attributes:
       policies: leaves `[num_objectives, ...]`, in the order of the objectives.
       chosen: the objective each was trained on, `[num_objectives]`.
-      learned_returns: of every trained policy (rows) under every reward (columns).
+      learned_returns: what every policy earns of the selecting reward, `[num_objectives]`.
     """
 
     policies: PolicyParams
@@ -114,21 +112,21 @@ def run(
 def select(
     key: jax.Array,
     config: PoliciesConfig,
-    margins: Sequence[float],
     env: Episode,
-    objectives: Sequence[policies.Objective],
+    objectives: Mapping[str, policies.Objective],
+    target: str,
     reward_fn: RewardFn,
     trained: Trained,
     directory: RunDirectory,
 ) -> Trained:
-    """Hands every objective its own policy or a better one of another's, see `stages.selection`.
+    """Hands one target whichever policy earns most of its reward; all others keep their own.
 
     Args:
       key: PRNG key.
-      config: settings of the policies.
-      margins: of every objective, as `selection.choose` takes them.
+      config: settings.
       env: episodes to judge in.
-      objectives: what was maximised.
+      objectives: what was maximised, by target.
+      target: the one that has no style of its own to lose.
       reward_fn: the reward whose parameters the objectives hold.
       trained: the policies, of the objectives in their order.
       directory: where the stage is saved, and restored from.
@@ -138,10 +136,11 @@ def select(
         selected = directory.load_output("selection", example)
     else:
         candidates = [trained.policy(i) for i in range(len(objectives))]
-        returns = learned_returns(key, env, objectives, candidates, config, reward_fn)
-        chosen = selection.choose(returns, jnp.asarray(margins))
-        handed_on = jax.tree.map(lambda x: x[chosen], trained.policies)
-        selected = Selected(handed_on, chosen, returns)
+        returns = _learned_returns(key, env, objectives[target], candidates, config, reward_fn)
+        chosen = (
+            jnp.arange(len(objectives)).at[list(objectives).index(target)].set(jnp.argmax(returns))
+        )
+        selected = Selected(jax.tree.map(lambda x: x[chosen], trained.policies), chosen, returns)
         directory.save_output("selection", selected)
     return Trained(selected.policies, trained.log, selected)
 
@@ -155,29 +154,18 @@ def best_start(
     reward_fn: RewardFn,
 ) -> PolicyParams:
     """The policy with the highest learned return."""
-    returns = learned_returns(key, env, [objective], starts, config, reward_fn)
-    return starts[int(np.argmax(returns[:, 0]))]
+    returns = _learned_returns(key, env, objective, starts, config, reward_fn)
+    return starts[int(jnp.argmax(returns))]
 
 
-def learned_returns(
-    key: jax.Array,
-    env: Episode,
-    objectives: Sequence[policies.Objective],
-    candidates: Sequence[PolicyParams],
-    config: PoliciesConfig,
-    reward_fn: RewardFn,
-) -> jax.Array:
-    """Mean learned return of policies in the same episodes, `[num_policies, num_objectives]`."""
-    rewards = stack([objective.params for objective in objectives])
-
-    @jax.jit
-    def judge(policy):
-        batch = policies.rollout(key, env, policy, config.eval_episodes, config)
-        return jax.vmap(
-            lambda params: jnp.mean(rollouts.learned_returns(batch, reward_fn, params))
-        )(rewards)
-
-    return jnp.stack([judge(policy) for policy in candidates])
+def _learned_returns(key, env, objective, candidates, config, reward_fn) -> jax.Array:
+    """What policies earn of an objective's reward, `[num_candidates]`."""
+    score = jax.jit(
+        lambda policy: (
+            policies.evaluate(key, env, objective, policy, config, reward_fn).learned_return
+        )
+    )
+    return jnp.stack([score(policy) for policy in candidates])
 
 
 def load(
@@ -214,5 +202,5 @@ def _selected_like(policies_like: PolicyParams, num_objectives: int) -> Selected
     return Selected(
         jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), policies_like),
         jax.ShapeDtypeStruct(shape, jnp.int32),
-        jax.ShapeDtypeStruct(shape * 2, jnp.float32),
+        jax.ShapeDtypeStruct(shape, jnp.float32),
     )

@@ -37,7 +37,6 @@ def plan(
             checkpoint_seconds,
             views=lambda rewards: _views(config, rewards),
             rewards_of=lambda rewards: rewards_of(config, rewards),
-            select=True,
         ),
     )
 
@@ -73,7 +72,6 @@ def last_stages(
     checkpoint_seconds: float,
     views: Callable[[regression.Rewards], dict[str, regression.View]],
     rewards_of: Callable[[regression.Rewards], dict[str, Callable[..., jax.Array]]],
-    select: bool = False,
 ) -> tuple[Stage, ...]:
     """What follows a regression: its rewards judged, policies on them, and these judged.
 
@@ -83,7 +81,6 @@ def last_stages(
       checkpoint_seconds: least time between two checkpoints.
       views: from what the regression returned to its rewards, by target, as parameters.
       rewards_of: the same as functions `reward(obs_t, action_t, next_obs_t)`.
-      select: whether a target may be handed another's policy, see `stages.selection`.
     """
     reward_fn = _reward_fn(config)
 
@@ -111,21 +108,10 @@ def last_stages(
             checkpoint_seconds,
         )
 
-    def hand_on(key, directory, rewards, trained) -> Trained:
+    def select(key, directory, rewards, trained) -> Trained:
         objectives = _objectives(config, problem.env, views(rewards))
-        # The task has no style of its own to lose.
-        margins = [
-            config.selection.margin if name in config.group_names else 0.0 for name in objectives
-        ]
         return policy_learning.select(
-            key,
-            config.policies,
-            margins,
-            problem.env,
-            list(objectives.values()),
-            reward_fn,
-            trained,
-            directory,
+            key, config.policies, problem.env, objectives, "task", reward_fn, trained, directory
         )
 
     def judge_policies(key, directory, rewards, trained):
@@ -142,9 +128,9 @@ def last_stages(
     if config.policy_names != config.target_names:
         settings["policy_targets"] = config.policy_names
     selection, handed_on = (), "policies"
-    if select:
-        inputs, handed_on = ("regression", "policies"), "selection"
-        selection = (Stage("selection", hand_on, inputs, {"selection": config.selection}),)
+    if config.selects:
+        selection = (Stage("selection", select, ("regression", "policies")),)
+        handed_on = "selection"
     return (
         Stage("reward_evaluation", judge_rewards, ("noise", "curve", "regression"), reports=True),
         Stage("policies", train, ("airl", "regression"), settings),

@@ -115,15 +115,13 @@ def returns_table(results: Mapping[str, Any]) -> Table | None:
 
 
 def _handed_on(results: Mapping[str, Any]) -> str:
-    """Which targets have another's policy, in a sentence; empty where none has."""
-    selection = results.get("selection") or {}
-    others = {
-        name: display_name(found["trained_for"]).lower()
-        for name, found in selection.items()
-        if found["trained_for"] != name
-    }
-    shown = ", ".join(f"{display_name(name)} has that of {of}" for name, of in others.items())
-    return f"Another's policy earns more of its reward than its own: {shown}. " if shown else ""
+    """Says whose policy the task has, where it is not its own."""
+    trained_for = (results.get("selection") or {}).get("trained_for", "task")
+    if trained_for == "task":
+        return ""
+    return (
+        f"The task has the policy of {display_name(trained_for).lower()}, which earns more of it. "
+    )
 
 
 def rewards_table(results: Mapping[str, Any]) -> Table | None:
