@@ -137,10 +137,10 @@ def select(
     else:
         candidates = [trained.policy(i) for i in range(len(objectives))]
         returns = _learned_returns(key, env, objectives[target], candidates, config, reward_fn)
-        chosen = (
-            jnp.arange(len(objectives)).at[list(objectives).index(target)].set(jnp.argmax(returns))
-        )
-        selected = Selected(jax.tree.map(lambda x: x[chosen], trained.policies), chosen, returns)
+        place = list(objectives).index(target)
+        chosen = jnp.arange(len(objectives)).at[place].set(jnp.argmax(returns))
+        handed_on = jax.tree.map(lambda x: x[chosen], trained.policies)
+        selected = Selected(handed_on, chosen, returns)
         directory.save_output("selection", selected)
     return Trained(selected.policies, trained.log, selected)
 

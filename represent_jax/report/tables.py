@@ -119,9 +119,7 @@ def _handed_on(results: Mapping[str, Any]) -> str:
     trained_for = (results.get("selection") or {}).get("trained_for", "task")
     if trained_for == "task":
         return ""
-    return (
-        f"The task has the policy of {display_name(trained_for).lower()}, which earns more of it. "
-    )
+    return f"The task has the policy of {display_name(trained_for).lower()}, which R^0 pays most. "
 
 
 def rewards_table(results: Mapping[str, Any]) -> Table | None:
