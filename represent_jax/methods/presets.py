@@ -147,22 +147,27 @@ QUICK_BUDGETS: dict[str, tuple[str, ...]] = {
     "franka_kitchen_hand": _QUICK_KITCHEN,
 }
 
+# Twice the updates on half the transitions learn faster by environment steps at a third more time.
+_FINER_UPDATES = ("policies.sac.updates_per_step=16", "policies.sac.batch_size=128")
+
 # What a domain needs beside a preset of full size, as overrides for the methods that have them.
 # `prior_weight` holds SAC near Phase 1's policy. Left to itself it finds on one seed in three of
 # HalfCheetah what a strategy's reward pays for by mistake: learned 27, true below 0.
 DOMAINS: dict[str, tuple[str, ...]] = {
     "franka_kitchen": _KITCHEN,
     "franka_kitchen_hand": _KITCHEN,
-    "half_cheetah": ("policies.sac.prior_weight=0.05",),
+    "half_cheetah": (*_FINER_UPDATES, "policies.sac.prior_weight=0.05"),
     "hopper": (
         # SSRR's levels for this domain, up to 0.8: at 0.95 a hopper lies as it never did at the
         # levels below, and that one level sets the lower end of the curve's scale.
         "noise.num_levels=17",
         *_GENTLE_IMITATION,
         # What keeps SAC from somersaults, 23 deviations away from anything rolled out: rewards and
-        # critics that promise nothing there.
+        # critics that promise nothing there, and a prior half as strong as without them.
         "regression.input_quantile=0.999",
         "policies.sac.critic_layer_norm=true",
+        "policies.sac.prior_weight=0.02",
+        *_FINER_UPDATES,
     ),
 }
 
