@@ -70,9 +70,9 @@ class RegressionConfig:
       input_quantile: rewards see no input beyond this quantile of the noisy rollouts, nor below
         its counterpart: what lies outside counts as being at the edge, so that nothing is paid for
         going on where nobody has been. Not bounded if none.
-      task_within_demonstrations: whether R^0 falls where what it sees is beyond all that was
-        demonstrated, as steeply as it rises within. More was better in all that was rolled out;
-        only demonstrations tell where to stop.
+      task_within_demonstrations: whether R^0 sees nothing beyond what was demonstrated, and falls
+        there as steeply as it rises within. More was better in all that was rolled out; only
+        demonstrations tell where to stop.
       learn_units: whether each strategy's curve has a unit of its own, learned with the rewards.
         Scaled to [0, 1] by themselves, curves say that all strategies are equally good without
         noise; R^0, which sees them all, then has to call the better one's rollouts too bad.
@@ -154,7 +154,7 @@ class Bounds(NamedTuple):
 
 
 class TaskRange(NamedTuple):
-    """Where R^0 is as fitted, and how it falls outside.
+    """Where R^0 is as fitted; beyond, it is what it is at the edge, less what it falls.
 
     Attributes:
       low, high: of what R^0 sees, in the demonstrations, `[task_input_dim]`.
@@ -571,15 +571,17 @@ def view_reward(
 ) -> jax.Array:
     """R^0 or R^i, `[...]`."""
     inputs = inputs_of(obs_t, action_t, next_obs_t, config)
-    fall = 0.0
-    if view.task_range is not None:
-        low, high, slope, most = view.task_range
-        reached = task_inputs_of(inputs, config)
-        distance = jnp.linalg.norm(reached - jnp.clip(reached, low, high), axis=-1)
-        fall = jnp.minimum(slope * distance, most)
+    reached = task_inputs_of(inputs, config)
     if view.bounds is not None:
         inputs = jnp.clip(inputs, *view.bounds)
-    task = head_reward(view.task, task_inputs_of(inputs, config), config) - fall
+    task_inputs = task_inputs_of(inputs, config)
+    if view.task_range is None:
+        task = head_reward(view.task, task_inputs, config)
+    else:
+        low, high, slope, most = view.task_range
+        task = head_reward(view.task, jnp.clip(task_inputs, low, high), config)
+        distance = jnp.linalg.norm(reached - jnp.clip(reached, low, high), axis=-1)
+        task -= jnp.minimum(slope * distance, most)
     return task + view.strategy_weight * head_reward(view.own, inputs, config)
 
 
