@@ -7,12 +7,12 @@ from represent_jax.config import require
 from represent_jax.data.trajectories import Demonstrations, Trajectory, without_pauses
 from represent_jax.envs import Environment, Episode
 from represent_jax.errors import RepresentError, UsageError, unknown
-from represent_jax.stages import airl, policies, regression
+from represent_jax.stages import airl, decomposition, policies
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.curve import CurveConfig
 from represent_jax.stages.noise import NoiseConfig
 from represent_jax.stages.policies import PoliciesConfig
-from represent_jax.stages.regression import RegressionConfig
+from represent_jax.stages.regression_config import RegressionConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,7 +174,7 @@ class RepresentConfig(MethodConfig):
         return "regression.include_action=true" if self.regression.include_action else ""
 
     def check_against(self, obs_dim: int) -> None:
-        regression.check_entries(self.regression, obs_dim)
+        decomposition.check_entries(self.regression, obs_dim)
 
 
 class Problem(NamedTuple):

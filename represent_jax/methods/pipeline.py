@@ -18,7 +18,7 @@ from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.population import Population, stack
 from represent_jax.runs import RunDirectory
 from represent_jax.runs.loop import advance
-from represent_jax.stages import airl, curve, noise, regression
+from represent_jax.stages import airl, curve, decomposition, noise, regression
 from represent_jax.types import Metrics, Params, PolicyFn, RewardFn, Transition
 
 # --- Phase 1 ---
@@ -208,7 +208,7 @@ def run_regression(
     curves: curve.Curve,
     directory: RunDirectory,
     checkpoint_seconds: float,
-) -> regression.Rewards:
+) -> decomposition.Rewards:
     """Phase 3: all rewards at once."""
     num_strategies = problem.demonstrations.num_strategies
     sizes = (problem.env.observation_size, problem.env.action_size, num_strategies)
@@ -242,7 +242,7 @@ def run_regressions(
     curves: curve.Curve,
     directory: RunDirectory,
     checkpoint_seconds: float,
-) -> regression.Rewards:
+) -> decomposition.Rewards:
     """A single reward of every strategy by itself; leaves are `[num_strategies, ...]`."""
     data = _regression_data(config, problem, noisy, curves)
     num_strategies = data.targets.shape[0]
@@ -253,7 +253,7 @@ def run_regressions(
         return regression.init(key, *sizes, config.regression)
 
     if directory.is_done("regression"):
-        example = regression.example(*sizes, config.regression)
+        example = decomposition.example(*sizes, config.regression)
         example = jax.tree.map(lambda x: shape_like(x, num_strategies), example)
         return directory.load_output("regression", example)
     population = Population(members, config.population)

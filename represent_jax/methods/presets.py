@@ -21,7 +21,7 @@ from represent_jax.stages.msrd import MsrdConfig
 from represent_jax.stages.noise import NoiseConfig
 from represent_jax.stages.policies import PoliciesConfig
 from represent_jax.stages.preference import PreferenceConfig
-from represent_jax.stages.regression import RegressionConfig
+from represent_jax.stages.regression_config import RegressionConfig
 
 _TINY_SAC = SacConfig(
     num_envs=4,

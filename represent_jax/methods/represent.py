@@ -14,7 +14,7 @@ from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.plan import Stage
 from represent_jax.methods.policy_learning import Trained
 from represent_jax.runs import RunDirectory
-from represent_jax.stages import airl, policies, regression
+from represent_jax.stages import airl, decomposition, policies
 from represent_jax.types import RewardFn
 
 
@@ -70,8 +70,8 @@ def last_stages(
     config: RepresentConfig,
     problem: Problem,
     checkpoint_seconds: float,
-    views: Callable[[regression.Rewards], dict[str, regression.View]],
-    rewards_of: Callable[[regression.Rewards], dict[str, Callable[..., jax.Array]]],
+    views: Callable[[decomposition.Rewards], dict[str, decomposition.View]],
+    rewards_of: Callable[[decomposition.Rewards], dict[str, Callable[..., jax.Array]]],
 ) -> tuple[Stage, ...]:
     """What follows a regression: its rewards judged, policies on them, and these judged.
 
@@ -140,12 +140,12 @@ def last_stages(
 
 
 def rewards_of(
-    config: RepresentConfig, rewards: regression.Rewards
+    config: RepresentConfig, rewards: decomposition.Rewards
 ) -> dict[str, Callable[..., jax.Array]]:
     """R^0 and every R^i that there is, by target."""
 
     def reward_of(strategy):
-        return lambda *rows: regression.reward(rewards, *rows, config.regression, strategy)
+        return lambda *rows: decomposition.reward(rewards, *rows, config.regression, strategy)
 
     return {name: reward_of(i - 1 if i else None) for i, name in enumerate(config.target_names)}
 
@@ -155,28 +155,30 @@ def load_rewards(
 ) -> dict[str, Callable[..., jax.Array]]:
     """R^0 and every R^i of a run, by target."""
     sizes = (env.observation_size, env.action_size, config.num_groups)
-    example = regression.example(*sizes, config.regression)
+    example = decomposition.example(*sizes, config.regression)
     return rewards_of(config, directory.load_output("regression", example))
 
 
-def _views(config: RepresentConfig, rewards: regression.Rewards) -> dict[str, regression.View]:
+def _views(
+    config: RepresentConfig, rewards: decomposition.Rewards
+) -> dict[str, decomposition.View]:
     return {
-        name: regression.view(rewards, i - 1 if i else None, config.regression)
+        name: decomposition.view(rewards, i - 1 if i else None, config.regression)
         for i, name in enumerate(config.target_names)
     }
 
 
 def _reward_fn(config: RepresentConfig) -> RewardFn:
-    """R^0 or R^i as a function of its `regression.View`."""
+    """R^0 or R^i as a function of its `decomposition.View`."""
 
     def reward_fn(view, obs_t, action_t, next_obs_t):
-        return regression.view_reward(view, obs_t, action_t, next_obs_t, config.regression)
+        return decomposition.view_reward(view, obs_t, action_t, next_obs_t, config.regression)
 
     return reward_fn
 
 
 def _objectives(
-    config: RepresentConfig, env: Episode, views: dict[str, regression.View]
+    config: RepresentConfig, env: Episode, views: dict[str, decomposition.View]
 ) -> dict[str, policies.Objective]:
     scale = env.horizon / config.regression.return_scale
     return {

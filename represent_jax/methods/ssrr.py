@@ -17,8 +17,8 @@ from represent_jax.methods import pipeline, represent
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.plan import Stage
 from represent_jax.runs import RunDirectory
-from represent_jax.stages import regression
-from represent_jax.stages.regression import RegressionConfig
+from represent_jax.stages import decomposition
+from represent_jax.stages.regression_config import RegressionConfig
 
 # What is left of Phase 3 where there is one reward; a single curve has no unit to learn.
 _NOTHING_ELSE = {
@@ -68,7 +68,7 @@ def plan(
 
     def views(rewards):
         return {
-            name: regression.view(one, None, config.regression)
+            name: decomposition.view(one, None, config.regression)
             for name, one in _by_target(config, rewards).items()
         }
 
@@ -93,12 +93,14 @@ def load_rewards(
     sizes = (env.observation_size, env.action_size, 1)
     example = jax.tree.map(
         lambda x: pipeline.shape_like(x, config.num_groups),
-        regression.example(*sizes, config.regression),
+        decomposition.example(*sizes, config.regression),
     )
     return _rewards_of(config, directory.load_output("regression", example))
 
 
-def _by_target(config: SsrrConfig, rewards: regression.Rewards) -> dict[str, regression.Rewards]:
+def _by_target(
+    config: SsrrConfig, rewards: decomposition.Rewards
+) -> dict[str, decomposition.Rewards]:
     return {
         name: jax.tree.map(lambda x, i=i: x[i], rewards)
         for i, name in enumerate(config.target_names)
@@ -106,9 +108,9 @@ def _by_target(config: SsrrConfig, rewards: regression.Rewards) -> dict[str, reg
 
 
 def _rewards_of(
-    config: SsrrConfig, rewards: regression.Rewards
+    config: SsrrConfig, rewards: decomposition.Rewards
 ) -> dict[str, Callable[..., jax.Array]]:
     def reward_of(one):
-        return lambda *rows: regression.reward(one, *rows, config.regression, None)
+        return lambda *rows: decomposition.reward(one, *rows, config.regression, None)
 
     return {name: reward_of(one) for name, one in _by_target(config, rewards).items()}

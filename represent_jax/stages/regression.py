@@ -11,8 +11,6 @@ needs a scale-free quantity it uses rho = r * horizon / return_scale, whose mean
 episode is 1.
 """
 
-import dataclasses
-import enum
 import functools
 from typing import NamedTuple
 
@@ -21,168 +19,21 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from represent_jax.config import later, require
 from represent_jax.data.trajectories import TrajectoryBatch
-from represent_jax.stages.mlp import Mlp, squared_kernels
-from represent_jax.types import Metrics, Params
+from represent_jax.stages.decomposition import (
+    Rewards,
+    bound,
+    draw,
+    inputs_of,
+    network,
+    task_inputs_of,
+)
+from represent_jax.stages.mlp import squared_kernels
+from represent_jax.stages.regression_config import Discrimination, RegressionConfig
+from represent_jax.types import Metrics
 
 # Adam moves every parameter by about its step size; a unit has to get farther than a weight.
 _UNIT_SPEED = 10.0
-
-
-class Discrimination(enum.StrEnum):
-    """How Eq. 5 is read; u_i(m) is the mean of rho^i over a demonstration of strategy m.
-
-    LOG_RATIO: (u_i(m) - sg u_i(i) - log w)^2, Eq. 5 in the exponent: a bounded target.
-    FLAIR: (exp u_i(m) - w exp sg u_i(i))^2, the loss of FLAIR's code with target ratio w.
-    LITERAL: (exp u_i(i) - exp u_i(m))^2, Eq. 5 as printed; it makes strategies equal.
-    """
-
-    LOG_RATIO = "log_ratio"
-    FLAIR = "flair"
-    LITERAL = "literal"
-
-
-@dataclasses.dataclass(frozen=True)
-class RegressionConfig:
-    """Settings of Phase 3.
-
-    Attributes:
-      num_updates: Adam steps.
-      num_snippets: snippets of each strategy in a step.
-      states_per_snippet: states drawn from a snippet to estimate its sum; even.
-      num_demonstration_states: states of each strategy's demonstrations in a step.
-      min_snippet_steps, max_snippet_steps: range of a snippet's length.
-      hidden_sizes: units of the hidden layers of every head.
-      learning_rate: Adam's step size.
-      kernel_scale: standard deviation of initial kernels (SSRR: 0.001).
-      l2: weight of R^0's squared kernels (SSRR: 0.1).
-      strategy_l2: weight of those of every R~^i, which Eq. 4 keeps small already.
-      ensemble_size: independent copies, whose mean is the reward.
-      return_scale: learned return of a whole episode whose curve value is 1 (SSRR: 10).
-      strategy_weight: alpha_i of Eq. 1, for all strategies.
-      lambda_ssrr, lambda_reg, lambda_bcd: weights of Eq. 2's terms.
-      discrimination: reading of Eq. 5.
-      discrimination_ratio: w, target of exp u_i(m) / exp u_i(i).
-      include_action: whether rewards see state and action as well as the next state.
-      task_entries: entries of the next observation that R^0 sees, such as the objects that a task
-        is about; everything that a R~^i sees if empty.
-      input_quantile: rewards see no input beyond this quantile of the noisy rollouts, nor below
-        its counterpart: what lies outside counts as being at the edge, so that nothing is paid for
-        going on where nobody has been. Not bounded if none.
-      task_within_demonstrations: whether R^0 sees nothing beyond what was demonstrated, and falls
-        there as steeply as it rises within. More was better in all that was rolled out; only
-        demonstrations tell where to stop.
-      learn_units: whether each strategy's curve has a unit of its own, learned with the rewards.
-        Scaled to [0, 1] by themselves, curves say that all strategies are equally good without
-        noise; R^0, which sees them all, then has to call the better one's rollouts too bad.
-    """
-
-    num_updates: int = 3000
-    num_snippets: int = 64
-    states_per_snippet: int = 16
-    num_demonstration_states: int = 256
-    min_snippet_steps: int = 50
-    max_snippet_steps: int = 500
-    hidden_sizes: tuple[int, ...] = (128, 128)
-    learning_rate: float = 1e-4
-    kernel_scale: float = 1e-3
-    l2: float = 0.1
-    strategy_l2: float = 0.01
-    ensemble_size: int = 3
-    return_scale: float = 10.0
-    strategy_weight: float = 1.0
-    lambda_ssrr: float = 1.0
-    lambda_reg: float = 0.1
-    lambda_bcd: float = 0.01
-    discrimination: str = "log_ratio"
-    discrimination_ratio: float = 0.7
-    include_action: bool = False
-    task_entries: tuple[int, ...] = later(())
-    input_quantile: float | None = later(None)
-    task_within_demonstrations: bool = later(False)
-    learn_units: bool = later(True, before=False)
-
-    def __post_init__(self) -> None:
-        for field in ("num_updates", "num_snippets", "ensemble_size", "min_snippet_steps"):
-            require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
-        require(
-            self.states_per_snippet >= 2 and self.states_per_snippet % 2 == 0,
-            "states_per_snippet",
-            "even and at least 2",
-            self.states_per_snippet,
-        )
-        require(
-            self.max_snippet_steps >= self.min_snippet_steps,
-            "max_snippet_steps",
-            f"at least min_snippet_steps ({self.min_snippet_steps})",
-            self.max_snippet_steps,
-        )
-        readings = tuple(Discrimination)
-        require(
-            self.discrimination in readings,
-            "discrimination",
-            f"one of {', '.join(readings)}",
-            self.discrimination,
-        )
-        require(
-            0.0 < self.discrimination_ratio <= 1.0,
-            "discrimination_ratio",
-            "in (0, 1]",
-            self.discrimination_ratio,
-        )
-        require(
-            all(entry >= 0 for entry in self.task_entries),
-            "task_entries",
-            "indices from 0",
-            self.task_entries,
-        )
-        if self.input_quantile is not None:
-            require(
-                0.5 < self.input_quantile <= 1.0,
-                "input_quantile",
-                "in (0.5, 1], or none",
-                self.input_quantile,
-            )
-
-
-class Bounds(NamedTuple):
-    """What of an input rewards see: nothing below `low` and nothing above `high`, `[input_dim]`."""
-
-    low: jax.Array
-    high: jax.Array
-
-
-class TaskRange(NamedTuple):
-    """Where R^0 is as fitted; beyond, it is what it is at the edge, less what it falls.
-
-    Attributes:
-      low, high: of what R^0 sees, in the demonstrations, `[task_input_dim]`.
-      slope: what it loses for a unit of distance from there, `[]`: `most` over the largest width.
-      most: the most that it loses, `[]`: what it differs by between demonstrated states.
-    """
-
-    low: jax.Array
-    high: jax.Array
-    slope: jax.Array
-    most: jax.Array
-
-
-class Rewards(NamedTuple):
-    """Parameters of all rewards.
-
-    Attributes:
-      task: R^0, leaves `[ensemble, ...]`.
-      strategies: R~^1 to R~^M, leaves `[ensemble, num_strategies, ...]`.
-      bounds: of their inputs; None without, and while they are fitted, since within the data they
-        change next to nothing.
-      task_range: of R^0; None without, and while they are fitted.
-    """
-
-    task: Params
-    strategies: Params
-    bounds: Bounds | None = None
-    task_range: TaskRange | None = None
 
 
 class RegressionData(NamedTuple):
@@ -231,27 +82,8 @@ class Snippets(NamedTuple):
 
 
 @functools.lru_cache
-def _head(config: RegressionConfig) -> Mlp:
-    return Mlp(config.hidden_sizes, config.kernel_scale)
-
-
-@functools.lru_cache
 def _optimizer(config: RegressionConfig) -> optax.GradientTransformation:
     return optax.adam(config.learning_rate)
-
-
-def _input_dim(obs_dim: int, action_dim: int, config: RegressionConfig) -> int:
-    return obs_dim + (obs_dim + action_dim if config.include_action else 0)
-
-
-def check_entries(config: RegressionConfig, obs_dim: int) -> None:
-    """Raises a UsageError where R^0 is to see entries that an observation does not have."""
-    require(
-        all(entry < obs_dim for entry in config.task_entries),
-        "task_entries",
-        f"indices of an observation of size {obs_dim}",
-        config.task_entries,
-    )
 
 
 def init(
@@ -262,82 +94,16 @@ def init(
     Raises:
       UsageError: R^0 is to see entries that an observation does not have.
     """
-    check_entries(config, obs_dim)
     key_task, key_strategies, key = jax.random.split(key, 3)
-    input_dim = _input_dim(obs_dim, action_dim, config)
-    head = _head(config)
-
-    def draw(key, input_dim):
-        return head.init(key, jnp.zeros(input_dim))
-
+    rewards = draw(key_task, key_strategies, obs_dim, action_dim, num_strategies, config)
     shape = (config.ensemble_size, num_strategies)
-    keys = jax.random.split(key_task, config.ensemble_size)
-    task = jax.vmap(lambda key: draw(key, len(config.task_entries) or input_dim))(keys)
-    keys = jax.random.split(key_strategies, shape)
-    strategies = jax.vmap(jax.vmap(lambda key: draw(key, input_dim)))(keys)
-    rewards = Rewards(task, strategies)
     log_units = jnp.zeros(shape) if config.learn_units else None
     return RegressionState(rewards, log_units, _optimizer(config).init((rewards, log_units)), key)
 
 
 def finish(state: RegressionState, data: RegressionData, config: RegressionConfig) -> Rewards:
-    """Reads the rewards, with the bounds of their inputs and R^0's range where there are to be."""
-    rewards = state.rewards
-    if config.input_quantile is not None:
-        levels = jnp.array([1.0 - config.input_quantile, config.input_quantile])
-        edges = jnp.nanquantile(_rows_of(data.noisy, config), levels, axis=0)
-        rewards = rewards._replace(bounds=Bounds(*edges))
-    if config.task_within_demonstrations:
-        rewards = rewards._replace(task_range=_task_range(rewards, data, config))
-    return rewards
-
-
-def _rows_of(batch: TrajectoryBatch, config: RegressionConfig) -> jax.Array:
-    """Inputs of all steps, `[rows, input_dim]`; NaN where an episode was over."""
-    inputs = inputs_of(batch.obs[..., :-1, :], batch.actions, batch.obs[..., 1:, :], config)
-    return jnp.where(batch.mask[..., None] > 0, inputs, jnp.nan).reshape(-1, inputs.shape[-1])
-
-
-def _task_range(rewards: Rewards, data: RegressionData, config: RegressionConfig) -> TaskRange:
-    rows = _rows_of(data.demonstrations, config)
-    seen = rows if rewards.bounds is None else jnp.clip(rows, *rewards.bounds)
-    earned = head_reward(rewards.task, task_inputs_of(seen, config), config)
-    most = jnp.nanmax(earned) - jnp.nanmin(earned)
-    rows = task_inputs_of(rows, config)
-    low, high = jnp.nanmin(rows, axis=0), jnp.nanmax(rows, axis=0)
-    return TaskRange(low, high, most / jnp.max(high - low), most)
-
-
-def example(
-    obs_dim: int, action_dim: int, num_strategies: int, config: RegressionConfig
-) -> Rewards:
-    """The shapes of what `finish` returns, for a checkpoint to be read into."""
-    sizes = (obs_dim, action_dim, num_strategies)
-    key = jax.random.PRNGKey(0)
-    rewards = jax.eval_shape(lambda key: init(key, *sizes, config), key).rewards
-    input_dim = _input_dim(obs_dim, action_dim, config)
-    if config.input_quantile is not None:
-        edge = jax.ShapeDtypeStruct((input_dim,), jnp.float32)
-        rewards = rewards._replace(bounds=Bounds(edge, edge))
-    if config.task_within_demonstrations:
-        edge = jax.ShapeDtypeStruct((len(config.task_entries) or input_dim,), jnp.float32)
-        number = jax.ShapeDtypeStruct((), jnp.float32)
-        rewards = rewards._replace(task_range=TaskRange(edge, edge, number, number))
-    return rewards
-
-
-def inputs_of(
-    obs_t: jax.Array, action_t: jax.Array | None, next_obs_t: jax.Array, config: RegressionConfig
-) -> jax.Array:
-    """What a R~^i sees: the state that the action led to, and on request what came before."""
-    if not config.include_action:
-        return next_obs_t
-    return jnp.concatenate([next_obs_t, obs_t, action_t], axis=-1)
-
-
-def task_inputs_of(inputs: jax.Array, config: RegressionConfig) -> jax.Array:
-    """What R^0 sees of it, `[..., task_input_dim]`."""
-    return inputs[..., config.task_entries] if config.task_entries else inputs
+    """Reads the rewards, bounded where they are to be."""
+    return bound(state.rewards, data.noisy, data.demonstrations, config)
 
 
 def sample_snippets(
@@ -438,7 +204,7 @@ def loss(
       horizon: T.
       config: settings.
     """
-    head = _head(config)
+    head = network(config)
     num_strategies, num_states, input_dim = demonstration_inputs.shape
     unit = horizon / config.return_scale
     rho_task = unit * head.apply(rewards.task, task_inputs_of(snippets.inputs, config))
@@ -525,74 +291,3 @@ def train(
         lambda state, _: step(state, data, config), state, None, length=num_updates
     )
     return state, jax.tree.map(jnp.mean, metrics)
-
-
-def head_reward(head: Params, inputs: jax.Array, config: RegressionConfig) -> jax.Array:
-    """Reward of one head, R^0 or R~^i: the mean over its ensemble `[ensemble, ...]`, `[...]`.
-
-    Args:
-      head: parameters.
-      inputs: of `inputs_of`, for R^0 of `task_inputs_of`.
-      config: settings.
-    """
-    return jnp.mean(jax.vmap(_head(config).apply, in_axes=(0, None))(head, inputs), axis=0)
-
-
-class View(NamedTuple):
-    """One reward of all, of the same shape for R^0 and every R^i.
-
-    Attributes:
-      task, own: parameters of R^0 and of one R~^i, leaves `[ensemble, ...]`.
-      strategy_weight: 0 for R^0, alpha_i for R^i, `[]`.
-      bounds: of the inputs.
-      task_range: of R^0.
-    """
-
-    task: Params
-    own: Params
-    strategy_weight: jax.Array
-    bounds: Bounds | None = None
-    task_range: TaskRange | None = None
-
-
-def view(rewards: Rewards, strategy: int | None, config: RegressionConfig) -> View:
-    """Picks R^0 (`strategy=None`) or R^i (counted from 0)."""
-    own = jax.tree.map(lambda leaf: leaf[:, strategy or 0], rewards.strategies)
-    weight = 0.0 if strategy is None else config.strategy_weight
-    return View(rewards.task, own, jnp.float32(weight), rewards.bounds, rewards.task_range)
-
-
-def view_reward(
-    view: View,
-    obs_t: jax.Array,
-    action_t: jax.Array,
-    next_obs_t: jax.Array,
-    config: RegressionConfig,
-) -> jax.Array:
-    """R^0 or R^i, `[...]`."""
-    inputs = inputs_of(obs_t, action_t, next_obs_t, config)
-    reached = task_inputs_of(inputs, config)
-    if view.bounds is not None:
-        inputs = jnp.clip(inputs, *view.bounds)
-    task_inputs = task_inputs_of(inputs, config)
-    if view.task_range is None:
-        task = head_reward(view.task, task_inputs, config)
-    else:
-        low, high, slope, most = view.task_range
-        task = head_reward(view.task, jnp.clip(task_inputs, low, high), config)
-        distance = jnp.linalg.norm(reached - jnp.clip(reached, low, high), axis=-1)
-        task -= jnp.minimum(slope * distance, most)
-    return task + view.strategy_weight * head_reward(view.own, inputs, config)
-
-
-def reward(
-    rewards: Rewards,
-    obs_t: jax.Array,
-    action_t: jax.Array,
-    next_obs_t: jax.Array,
-    config: RegressionConfig,
-    strategy: int | None = None,
-) -> jax.Array:
-    """R^0, or R^i = R^0 + alpha_i R~^i (Eq. 1) of one strategy counted from 0, `[...]`."""
-    one = view(rewards, strategy, config)
-    return view_reward(one, obs_t, action_t, next_obs_t, config)

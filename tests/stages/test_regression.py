@@ -1,7 +1,6 @@
 """Phase 3: each term of Eq. 2 in closed form, and a synthetic problem with a known answer."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +9,9 @@ import pytest
 
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.errors import UsageError
-from represent_jax.stages import evaluation, regression
-from represent_jax.stages.regression import RegressionConfig, RegressionData
+from represent_jax.stages import decomposition, evaluation, regression
+from represent_jax.stages.regression import RegressionData
+from represent_jax.stages.regression_config import RegressionConfig
 
 CONFIG = RegressionConfig(
     num_updates=300,
@@ -101,105 +101,6 @@ def test_discrimination_pushes_only_the_other_strategies_down():
     assert float(grads[0, 1]) > 0.0 and float(grads[1, 0]) > 0.0
 
 
-def test_reward_is_task_plus_weighted_strategy():
-    config = dataclasses.replace(CONFIG, strategy_weight=0.5, ensemble_size=2)
-    rewards = regression.init(jax.random.PRNGKey(0), 3, 1, 2, config).rewards
-    obs = jax.random.normal(jax.random.PRNGKey(1), (7, 3))
-    task = regression.reward(rewards, obs, None, obs, config)
-    head = jax.tree.map(lambda leaf: leaf[:, 1], rewards.strategies)
-    own = regression.head_reward(head, obs, config)
-    found = regression.reward(rewards, obs, None, obs, config, strategy=1)
-    np.testing.assert_allclose(found, task + 0.5 * own, rtol=1e-6)
-
-
-def test_task_reward_sees_its_entries_and_strategies_see_all():
-    config = dataclasses.replace(CONFIG, task_entries=(2, 0), include_action=True)
-    rewards = regression.init(jax.random.PRNGKey(0), 3, 1, 2, config).rewards
-    row = jax.random.normal(jax.random.PRNGKey(1), (3,))
-    action = jnp.array([0.3])
-
-    def slopes(strategy):
-        reward = functools.partial(regression.reward, rewards, config=config, strategy=strategy)
-        by = jax.grad(lambda *rows: reward(*rows), argnums=(0, 1, 2))(row, action, row)
-        return [np.abs(slope) > 0.0 for slope in by]
-
-    before, by_action, after = slopes(None)
-    assert not before.any() and not by_action.any()
-    np.testing.assert_array_equal(after, [True, False, True])
-    assert all(seen.all() for seen in slopes(1))
-
-
-def test_task_entries_outside_the_observation_are_refused():
-    config = dataclasses.replace(CONFIG, task_entries=(0, 3))
-    with pytest.raises(UsageError, match=r"task_entries.*size 3.*\(0, 3\)"):
-        regression.init(jax.random.PRNGKey(0), 3, 1, 2, config)
-    with pytest.raises(UsageError, match="task_entries"):
-        dataclasses.replace(CONFIG, task_entries=(-1,))
-
-
-def test_bounded_rewards_pay_nothing_for_going_beyond_what_was_rolled_out():
-    config = dataclasses.replace(CONFIG, input_quantile=1.0)
-    noisy = _batch(np.random.default_rng(0).normal(size=(3, 21, 2)), lengths=[19, 19, 19])
-    # Past the end of an episode nothing was rolled out.
-    noisy = jax.tree.map(lambda x: x[None], noisy._replace(obs=noisy.obs.at[:, -1].set(1e6)))
-    data = RegressionData(noisy, jnp.ones((1, 3)), noisy)
-    state = regression.init(jax.random.PRNGKey(1), 2, 1, 1, config)
-    rewards = regression.finish(state, data, config)
-    reached = noisy.obs[:, :, 1:-1].reshape(-1, 2)
-    np.testing.assert_allclose(rewards.bounds.high, reached.max(axis=0))
-    np.testing.assert_allclose(rewards.bounds.low, reached.min(axis=0))
-    for edge, beyond in ((rewards.bounds.high, 5.0), (rewards.bounds.low, -5.0)):
-        for strategy in (None, 0):
-            there = regression.reward(rewards, None, None, edge, config, strategy)
-            farther = regression.reward(rewards, None, None, edge + beyond, config, strategy)
-            np.testing.assert_array_equal(farther, there)
-    assert jax.tree.map(jnp.shape, rewards) == jax.tree.map(
-        jnp.shape, regression.example(2, 1, 1, config)
-    )
-
-
-@pytest.mark.parametrize("quantile", [None, 1.0])
-def test_the_task_reward_falls_beyond_what_was_demonstrated(quantile):
-    config = dataclasses.replace(
-        CONFIG, task_entries=(0, 2), task_within_demonstrations=True, input_quantile=quantile
-    )
-    random = np.random.default_rng(0)
-    noisy = _batch(random.uniform(-3.0, 3.0, size=(3, 21, 3)))
-    demonstrations = _batch(random.uniform(-1.0, 1.0, size=(2, 21, 3)) * [1.0, 1.0, 0.5])
-    noisy, alone = (jax.tree.map(lambda x: x[None], one) for one in (noisy, demonstrations))
-    data = RegressionData(noisy, jnp.ones((1, 3)), alone)
-    state = regression.init(jax.random.PRNGKey(1), 3, 1, 1, config)
-    rewards = regression.finish(state, data, config)
-    fitted = rewards._replace(task_range=None)
-    states = demonstrations.obs[:, 1:].reshape(-1, 3)
-    low, high = states.min(axis=0), states.max(axis=0)
-
-    def fall(obs):
-        at_edge = obs.at[..., jnp.array([0, 2])].set(
-            jnp.clip(obs, low, high)[..., jnp.array([0, 2])]
-        )
-        before = regression.reward(fitted, None, None, at_edge, config)
-        return before - regression.reward(rewards, None, None, obs, config)
-
-    np.testing.assert_array_equal(fall(states), 0.0)
-    own = [regression.reward(one, None, None, states + 9.0, config, 0) for one in (fitted, rewards)]
-    task = [regression.reward(one, None, None, states + 9.0, config) for one in (fitted, rewards)]
-    np.testing.assert_allclose(own[0] - task[0], own[1] - task[1], rtol=1e-3, atol=1e-7)
-    earned = regression.reward(fitted, None, None, states, config)
-    most = earned.max() - earned.min()
-    width = (high - low)[0]
-    edge = jnp.array([high[0], 0.0, 0.0])
-    for share in (0.25, 0.5):
-        beyond = edge + jnp.array([share * width, 0.0, 0.0])
-        np.testing.assert_allclose(fall(beyond), share * most, rtol=1e-3)
-    np.testing.assert_allclose(fall(edge + 50.0), most, rtol=1e-3)
-    # What is not of the task may go where it will.
-    np.testing.assert_allclose(fall(jnp.array([0.0, 50.0, 0.0])), 0.0, atol=1e-9)
-    assert jax.tree.map(jnp.shape, rewards) == jax.tree.map(
-        jnp.shape, regression.example(3, 1, 1, config)
-    )
-
-
 def test_known_reward_is_recovered_and_decomposed():
     """Two strategies in different places; the curve knows a shared feature, x, and nothing else."""
     key = jax.random.PRNGKey(0)
@@ -220,7 +121,7 @@ def test_known_reward_is_recovered_and_decomposed():
     assert float(metrics["strategy_reward_own"]) > float(metrics["strategy_reward_others"])
     unseen = jax.random.uniform(jax.random.PRNGKey(2), (200, 2), minval=-1.0, maxval=1.0)
     for strategy in (None, 0, 1):
-        learned = regression.reward(state.rewards, unseen, None, unseen, CONFIG, strategy)
+        learned = decomposition.reward(state.rewards, unseen, None, unseen, CONFIG, strategy)
         assert float(evaluation.pearson(unseen[:, 0], learned)) > 0.9
 
 
