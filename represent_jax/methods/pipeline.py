@@ -316,7 +316,8 @@ def run_updates(
       describe: what to show of the metrics beside the progress.
     """
     if directory.is_done(stage):
-        return directory.load_output(stage, finish(jax.eval_shape(init, key)))
+        example = jax.eval_shape(lambda key: finish(init(key)), key)
+        return directory.load_output(stage, example)
     per_chunk = max(1, num_updates // 20)
     compiled = jax.jit(lambda state, data: train(state, data, per_chunk), donate_argnums=0)
     state = advance(

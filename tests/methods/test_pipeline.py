@@ -13,6 +13,7 @@ from represent_jax.methods import pipeline
 from represent_jax.methods.config import make_problem
 from represent_jax.methods.population import stack
 from represent_jax.methods.presets import make_config
+from represent_jax.runs import open_run
 from represent_jax.stages import airl, noise
 
 CONFIG = make_config("smoke", "half_cheetah")
@@ -74,3 +75,21 @@ def test_curves_are_of_the_floored_returns_unless_told_otherwise(given):
     low, high = typical.min(axis=1, keepdims=True), typical.max(axis=1, keepdims=True)
     curves = pipeline.fit_curves(CONFIG, problem, first, noisy)
     np.testing.assert_allclose(curves.scaled_returns, (typical - low) / (high - low), atol=1e-5)
+
+
+def test_bounded_rewards_are_found_again(given, tmp_path):
+    problem, first, noisy, _ = given
+    bounded = dataclasses.replace(
+        CONFIG.regression, input_quantile=0.99, task_within_demonstrations=True
+    )
+    config = dataclasses.replace(CONFIG, regression=bounded)
+    curves = pipeline.fit_curves(config, problem, first, noisy)
+    with open_run(tmp_path / "run", config) as run:
+        fitted, found = (
+            pipeline.run_regression(
+                jax.random.PRNGKey(2), config, problem, noisy, curves, run, checkpoint_seconds=60.0
+            )
+            for _ in range(2)
+        )
+    assert fitted.bounds is not None and fitted.task_range is not None
+    jax.tree.map(np.testing.assert_array_equal, fitted, found)
