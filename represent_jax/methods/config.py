@@ -13,6 +13,7 @@ from represent_jax.stages.curve import CurveConfig
 from represent_jax.stages.noise import NoiseConfig
 from represent_jax.stages.policies import PoliciesConfig
 from represent_jax.stages.regression_config import RegressionConfig
+from represent_jax.stages.selection import SelectionConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,9 +119,8 @@ class RepresentConfig(MethodConfig):
 
     Attributes:
       policy_targets: targets that a policy is trained for; all if empty.
-      airl, noise, curve, regression, policies: settings of the stages.
-      task_policy: what the task is handed: "best" of all policies the one that earns most of R^0,
-        "own" the one trained on R^0. Strategies are handed their own, which have their styles.
+      airl, noise, curve, regression, policies, selection: settings of the stages; nothing is
+        selected where only one policy is trained, or the rewards are not of one task.
     """
 
     policy_targets: tuple[str, ...] = ()
@@ -129,12 +129,10 @@ class RepresentConfig(MethodConfig):
     curve: CurveConfig = CurveConfig()
     regression: RegressionConfig = RegressionConfig()
     policies: PoliciesConfig = PoliciesConfig()
-    task_policy: str = "best"
+    selection: SelectionConfig = SelectionConfig()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        known = ("best", "own")
-        require(self.task_policy in known, "task_policy", "'best' or 'own'", self.task_policy)
         for name in self.policy_targets:
             if name not in self.target_names:
                 raise unknown("policy target", name, self.target_names)
@@ -162,9 +160,8 @@ class RepresentConfig(MethodConfig):
 
     @property
     def selects(self) -> bool:
-        """Whether the task's policy is chosen among several."""
-        among = self.policy_names
-        return self.task_policy == "best" and "task" in among and len(among) > 1
+        """Whether there are several policies on rewards of one task to choose among."""
+        return self.regression.strategy_weight > 0.0 and len(self.policy_names) > 1
 
     @property
     def needs_actions(self) -> str:

@@ -1,11 +1,13 @@
 """Policies on learned rewards, all targets as one population on a run directory, and selection."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from represent_jax.agents import rollout as rollouts
 from represent_jax.agents.sac import PolicyParams
 from represent_jax.envs import Environment, Episode
 from represent_jax.methods.config import MethodConfig
@@ -13,7 +15,7 @@ from represent_jax.methods.pipeline import numbers, shape_like
 from represent_jax.methods.population import Population, stack
 from represent_jax.runs import RunDirectory
 from represent_jax.runs.loop import advance
-from represent_jax.stages import policies
+from represent_jax.stages import policies, selection
 from represent_jax.stages.policies import PoliciesConfig
 from represent_jax.types import RewardFn
 
@@ -24,7 +26,7 @@ class Selected(NamedTuple):
     Attributes:
       policies: leaves `[num_objectives, ...]`, in the order of the objectives.
       chosen: the objective each was trained on, `[num_objectives]`.
-      learned_returns: what every policy earns of the selecting reward, `[num_objectives]`.
+      learned_returns: of every trained policy (rows) under every reward (columns).
     """
 
     policies: PolicyParams
@@ -112,21 +114,21 @@ def run(
 def select(
     key: jax.Array,
     config: PoliciesConfig,
+    margins: Sequence[float],
     env: Episode,
-    objectives: Mapping[str, policies.Objective],
-    target: str,
+    objectives: Sequence[policies.Objective],
     reward_fn: RewardFn,
     trained: Trained,
     directory: RunDirectory,
 ) -> Trained:
-    """Hands one target whichever policy earns most of its reward; all others keep their own.
+    """Hands every objective its own policy or a better one of another's, see `stages.selection`.
 
     Args:
       key: PRNG key.
-      config: settings.
+      config: settings of the policies.
+      margins: of every objective, as `selection.choose` takes them.
       env: episodes to judge in.
-      objectives: what was maximised, by target.
-      target: the one that has no style of its own to lose.
+      objectives: what was maximised.
       reward_fn: the reward whose parameters the objectives hold.
       trained: the policies, of the objectives in their order.
       directory: where the stage is saved, and restored from.
@@ -136,9 +138,8 @@ def select(
         selected = directory.load_output("selection", example)
     else:
         candidates = [trained.policy(i) for i in range(len(objectives))]
-        returns = _learned_returns(key, env, objectives[target], candidates, config, reward_fn)
-        place = list(objectives).index(target)
-        chosen = jnp.arange(len(objectives)).at[place].set(jnp.argmax(returns))
+        returns = learned_returns(key, env, objectives, candidates, config, reward_fn)
+        chosen = selection.choose(returns, jnp.asarray(margins))
         handed_on = jax.tree.map(lambda x: x[chosen], trained.policies)
         selected = Selected(handed_on, chosen, returns)
         directory.save_output("selection", selected)
@@ -154,18 +155,29 @@ def best_start(
     reward_fn: RewardFn,
 ) -> PolicyParams:
     """The policy with the highest learned return."""
-    returns = _learned_returns(key, env, objective, starts, config, reward_fn)
-    return starts[int(jnp.argmax(returns))]
+    returns = learned_returns(key, env, [objective], starts, config, reward_fn)
+    return starts[int(np.argmax(returns[:, 0]))]
 
 
-def _learned_returns(key, env, objective, candidates, config, reward_fn) -> jax.Array:
-    """What policies earn of an objective's reward, `[num_candidates]`."""
-    score = jax.jit(
-        lambda policy: (
-            policies.evaluate(key, env, objective, policy, config, reward_fn).learned_return
-        )
-    )
-    return jnp.stack([score(policy) for policy in candidates])
+def learned_returns(
+    key: jax.Array,
+    env: Episode,
+    objectives: Sequence[policies.Objective],
+    candidates: Sequence[PolicyParams],
+    config: PoliciesConfig,
+    reward_fn: RewardFn,
+) -> jax.Array:
+    """Mean learned return of policies in the same episodes, `[num_policies, num_objectives]`."""
+    rewards = stack([objective.params for objective in objectives])
+
+    @jax.jit
+    def judge(policy):
+        batch = policies.rollout(key, env, policy, config.eval_episodes, config)
+        return jax.vmap(
+            lambda params: jnp.mean(rollouts.learned_returns(batch, reward_fn, params))
+        )(rewards)
+
+    return jnp.stack([judge(policy) for policy in candidates])
 
 
 def load(
@@ -202,5 +214,5 @@ def _selected_like(policies_like: PolicyParams, num_objectives: int) -> Selected
     return Selected(
         jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), policies_like),
         jax.ShapeDtypeStruct(shape, jnp.int32),
-        jax.ShapeDtypeStruct(shape, jnp.float32),
+        jax.ShapeDtypeStruct(shape * 2, jnp.float32),
     )

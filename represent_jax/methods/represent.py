@@ -110,8 +110,19 @@ def last_stages(
 
     def select(key, directory, rewards, trained) -> Trained:
         objectives = _objectives(config, problem.env, views(rewards))
+        chosen = config.selection
+        margins = [
+            chosen.task_margin if name == "task" else chosen.strategy_margin for name in objectives
+        ]
         return policy_learning.select(
-            key, config.policies, problem.env, objectives, "task", reward_fn, trained, directory
+            key,
+            config.policies,
+            margins,
+            problem.env,
+            list(objectives.values()),
+            reward_fn,
+            trained,
+            directory,
         )
 
     def judge_policies(key, directory, rewards, trained):
@@ -129,7 +140,8 @@ def last_stages(
         settings["policy_targets"] = config.policy_names
     selection, handed_on = (), "policies"
     if config.selects:
-        selection = (Stage("selection", select, ("regression", "policies")),)
+        inputs = ("regression", "policies")
+        selection = (Stage("selection", select, inputs, {"selection": config.selection}),)
         handed_on = "selection"
     return (
         Stage("reward_evaluation", judge_rewards, ("noise", "curve", "regression"), reports=True),

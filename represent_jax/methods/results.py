@@ -276,15 +276,18 @@ def judge_policies(
 
 
 def describe_selection(config: MethodConfig, trained: Trained) -> dict[str, Any]:
-    """Whose policy the task is handed, and what every policy earns of R^0, if one was selected."""
+    """Whose policy every target is handed, and what all policies earn of its reward, if any."""
     if trained.selected is None:
         return {}
     names = config.policy_names
-    returns = trained.selected.learned_returns.tolist()
+    returns = np.asarray(trained.selected.learned_returns)
     return {
         "selection": {
-            "trained_for": names[int(trained.selected.chosen[names.index("task")])],
-            "learned_returns": dict(zip(names, returns, strict=True)),
+            name: {
+                "trained_for": names[int(trained.selected.chosen[i])],
+                "learned_returns": dict(zip(names, returns[:, i].tolist(), strict=True)),
+            }
+            for i, name in enumerate(names)
         }
     }
 

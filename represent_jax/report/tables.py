@@ -115,11 +115,17 @@ def returns_table(results: Mapping[str, Any]) -> Table | None:
 
 
 def _handed_on(results: Mapping[str, Any]) -> str:
-    """Says whose policy the task has, where it is not its own."""
-    trained_for = (results.get("selection") or {}).get("trained_for", "task")
-    if trained_for == "task":
-        return ""
-    return f"The task has the policy of {display_name(trained_for).lower()}, which R^0 pays most. "
+    """Says which targets have another's policy, empty where none has."""
+    others = {
+        name: found["trained_for"]
+        for name, found in (results.get("selection") or {}).items()
+        if found["trained_for"] != name
+    }
+    return "".join(
+        f"{display_name(name)} has the policy of {display_name(of).lower()}, which its reward pays "
+        "more. "
+        for name, of in others.items()
+    )
 
 
 def rewards_table(results: Mapping[str, Any]) -> Table | None:
