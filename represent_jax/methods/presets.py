@@ -107,10 +107,10 @@ _KITCHEN = (
     # what is left over: at 0.1 R^0 orders noise levels backwards.
     "regression.lambda_reg=5",
     # Farther was better in all that was rolled out: without an end to it, R^0 pays a third more for
-    # a kettle that is pushed far beyond its burner than for one upon it. Rollouts go as far as
-    # 8 cm beyond; only demonstrations end where the task does.
+    # a kettle that is pushed far beyond its burner than for one upon it, and R~^i for fingers
+    # closed as nobody closed them. Only demonstrations end where the task does.
     "regression.input_quantile=0.999",
-    "regression.task_within_demonstrations=true",
+    "regression.within_demonstrations=true",
     # The mode of a policy that pushes may pass the kettle by a little, where its samples do not.
     "policies.actions=sampled",
     *(

@@ -47,13 +47,15 @@ class Rewards(NamedTuple):
       strategies: R~^1 to R~^M, leaves `[ensemble, num_strategies, ...]`.
       bounds: of their inputs; None without, and while they are fitted, since within the data they
         change next to nothing.
-      task_range: of R^0; None without, and while they are fitted.
+      task_range, own_bounds: of R^0, and of every R~^i `[num_strategies, input_dim]`; None without,
+        and while they are fitted.
     """
 
     task: Params
     strategies: Params
     bounds: Bounds | None = None
     task_range: TaskRange | None = None
+    own_bounds: Bounds | None = None
 
 
 class View(NamedTuple):
@@ -63,7 +65,7 @@ class View(NamedTuple):
       task, own: parameters of R^0 and of one R~^i, leaves `[ensemble, ...]`.
       strategy_weight: 0 for R^0, alpha_i for R^i, `[]`.
       bounds: of the inputs.
-      task_range: of R^0.
+      task_range, own_bounds: of R^0 and of the R~^i.
     """
 
     task: Params
@@ -71,6 +73,7 @@ class View(NamedTuple):
     strategy_weight: jax.Array
     bounds: Bounds | None = None
     task_range: TaskRange | None = None
+    own_bounds: Bounds | None = None
 
 
 @functools.lru_cache
@@ -126,10 +129,13 @@ def example(
     if config.input_quantile is not None:
         edge = jax.ShapeDtypeStruct((input_dim,), jnp.float32)
         rewards = rewards._replace(bounds=Bounds(edge, edge))
-    if config.task_within_demonstrations:
+    if config.within_demonstrations:
         edge = jax.ShapeDtypeStruct((len(config.task_entries) or input_dim,), jnp.float32)
         number = jax.ShapeDtypeStruct((), jnp.float32)
-        rewards = rewards._replace(task_range=TaskRange(edge, edge, number, number))
+        edges = jax.ShapeDtypeStruct((num_strategies, input_dim), jnp.float32)
+        rewards = rewards._replace(
+            task_range=TaskRange(edge, edge, number, number), own_bounds=Bounds(edges, edges)
+        )
     return rewards
 
 
@@ -139,19 +145,23 @@ def bound(
     demonstrations: TrajectoryBatch,
     config: RegressionConfig,
 ) -> Rewards:
-    """Gives fitted rewards the bounds of their inputs and R^0's range, where there are to be any.
+    """Gives fitted rewards the bounds of their inputs, where there are to be any.
 
     Args:
       rewards: as fitted.
-      noisy, demonstrations: what they were fitted on, with any leading axes.
+      noisy, demonstrations: what they were fitted on, `[num_strategies, num_trajectories]`.
       config: settings.
     """
     if config.input_quantile is not None:
         levels = jnp.array([1.0 - config.input_quantile, config.input_quantile])
         edges = jnp.nanquantile(_rows_of(noisy, config), levels, axis=0)
         rewards = rewards._replace(bounds=Bounds(*edges))
-    if config.task_within_demonstrations:
-        rewards = rewards._replace(task_range=_task_range(rewards, demonstrations, config))
+    if config.within_demonstrations:
+        rows = jax.vmap(lambda batch: _rows_of(batch, config))(demonstrations)
+        rewards = rewards._replace(
+            task_range=_task_range(rewards, rows, config),
+            own_bounds=Bounds(jnp.nanmin(rows, axis=1), jnp.nanmax(rows, axis=1)),
+        )
     return rewards
 
 
@@ -161,10 +171,9 @@ def _rows_of(batch: TrajectoryBatch, config: RegressionConfig) -> jax.Array:
     return jnp.where(batch.mask[..., None] > 0, inputs, jnp.nan).reshape(-1, inputs.shape[-1])
 
 
-def _task_range(
-    rewards: Rewards, demonstrations: TrajectoryBatch, config: RegressionConfig
-) -> TaskRange:
-    rows = _rows_of(demonstrations, config)
+def _task_range(rewards: Rewards, rows: jax.Array, config: RegressionConfig) -> TaskRange:
+    """Where demonstrations, `[num_strategies, rows, input_dim]`, left what R^0 sees."""
+    rows = rows.reshape(-1, rows.shape[-1])
     seen = rows if rewards.bounds is None else jnp.clip(rows, *rewards.bounds)
     earned = head_reward(rewards.task, task_inputs_of(seen, config), config)
     most = jnp.nanmax(earned) - jnp.nanmin(earned)
@@ -189,9 +198,11 @@ def task_inputs_of(inputs: jax.Array, config: RegressionConfig) -> jax.Array:
 
 def view(rewards: Rewards, strategy: int | None, config: RegressionConfig) -> View:
     """Picks R^0 (`strategy=None`) or R^i (counted from 0)."""
-    own = jax.tree.map(lambda leaf: leaf[:, strategy or 0], rewards.strategies)
-    weight = 0.0 if strategy is None else config.strategy_weight
-    return View(rewards.task, own, jnp.float32(weight), rewards.bounds, rewards.task_range)
+    i = strategy or 0
+    own = jax.tree.map(lambda leaf: leaf[:, i], rewards.strategies)
+    own_bounds = jax.tree.map(lambda leaf: leaf[i], rewards.own_bounds)
+    weight = jnp.float32(0.0 if strategy is None else config.strategy_weight)
+    return View(rewards.task, own, weight, rewards.bounds, rewards.task_range, own_bounds)
 
 
 def view_reward(
@@ -214,6 +225,8 @@ def view_reward(
         task = head_reward(view.task, jnp.clip(task_inputs, low, high), config)
         distance = jnp.linalg.norm(reached - jnp.clip(reached, low, high), axis=-1)
         task -= jnp.minimum(slope * distance, most)
+    if view.own_bounds is not None:
+        inputs = jnp.clip(inputs, *view.own_bounds)
     return task + view.strategy_weight * head_reward(view.own, inputs, config)
 
 

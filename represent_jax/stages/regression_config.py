@@ -46,9 +46,9 @@ class RegressionConfig:
       input_quantile: rewards see no input beyond this quantile of the noisy rollouts, nor below
         its counterpart: what lies outside counts as being at the edge, so that nothing is paid for
         going on where nobody has been. Not bounded if none.
-      task_within_demonstrations: whether R^0 sees nothing beyond what was demonstrated, and falls
-        there as steeply as it rises within. More was better in all that was rolled out; only
-        demonstrations tell where to stop.
+      within_demonstrations: whether rewards see nothing beyond what was demonstrated, R^0 by all,
+        R~^i by strategy i, and R^0 falls there as steeply as it rises within. More of the task was
+        better in all that was rolled out; only demonstrations tell where to stop.
       learn_units: whether each strategy's curve has a unit of its own, learned with the rewards.
         Scaled to [0, 1] by themselves, curves say that all strategies are equally good without
         noise; R^0, which sees them all, then has to call the better one's rollouts too bad.
@@ -76,7 +76,7 @@ class RegressionConfig:
     include_action: bool = False
     task_entries: tuple[int, ...] = later(())
     input_quantile: float | None = later(None)
-    task_within_demonstrations: bool = later(False)
+    within_demonstrations: bool = later(False)
     learn_units: bool = later(True, before=False)
 
     def __post_init__(self) -> None:

@@ -80,7 +80,7 @@ def test_curves_are_of_the_floored_returns_unless_told_otherwise(given):
 def test_bounded_rewards_are_found_again(given, tmp_path):
     problem, first, noisy, _ = given
     bounded = dataclasses.replace(
-        CONFIG.regression, input_quantile=0.99, task_within_demonstrations=True
+        CONFIG.regression, input_quantile=0.99, within_demonstrations=True
     )
     config = dataclasses.replace(CONFIG, regression=bounded)
     curves = pipeline.fit_curves(config, problem, first, noisy)

@@ -93,14 +93,14 @@ def test_bounded_rewards_pay_nothing_for_going_beyond_what_was_rolled_out():
 @pytest.mark.parametrize("quantile", [None, 1.0])
 def test_the_task_reward_falls_beyond_what_was_demonstrated(quantile):
     config = dataclasses.replace(
-        CONFIG, task_entries=(0, 2), task_within_demonstrations=True, input_quantile=quantile
+        CONFIG, task_entries=(0, 2), within_demonstrations=True, input_quantile=quantile
     )
     random = np.random.default_rng(0)
     noisy = _batch(random.uniform(-3.0, 3.0, size=(3, 21, 3)))
     demonstrations = _batch(random.uniform(-1.0, 1.0, size=(2, 21, 3)) * [1.0, 1.0, 0.5])
     noisy, alone = (jax.tree.map(lambda x: x[None], one) for one in (noisy, demonstrations))
     rewards = decomposition.bound(draw(3, 1, config), noisy, alone, config)
-    fitted = rewards._replace(task_range=None)
+    fitted = rewards._replace(task_range=None, own_bounds=None)
     states = demonstrations.obs[:, 1:].reshape(-1, 3)
     low, high = states.min(axis=0), states.max(axis=0)
 
@@ -112,13 +112,6 @@ def test_the_task_reward_falls_beyond_what_was_demonstrated(quantile):
         return before - decomposition.reward(rewards, None, None, obs, config)
 
     np.testing.assert_array_equal(fall(states), 0.0)
-    own = [
-        decomposition.reward(one, None, None, states + 9.0, config, 0) for one in (fitted, rewards)
-    ]
-    task = [
-        decomposition.reward(one, None, None, states + 9.0, config) for one in (fitted, rewards)
-    ]
-    np.testing.assert_allclose(own[0] - task[0], own[1] - task[1], rtol=1e-3, atol=1e-7)
     earned = decomposition.reward(fitted, None, None, states, config)
     most = earned.max() - earned.min()
     width = (high - low)[0]
@@ -132,3 +125,27 @@ def test_the_task_reward_falls_beyond_what_was_demonstrated(quantile):
     assert jax.tree.map(jnp.shape, rewards) == jax.tree.map(
         jnp.shape, decomposition.example(3, 1, 1, config)
     )
+
+
+def test_a_strategy_is_paid_for_nothing_that_it_did_not_show():
+    config = dataclasses.replace(CONFIG, within_demonstrations=True)
+    random = np.random.default_rng(0)
+    # The second strategy goes twice as far.
+    both = [_batch(random.uniform(-far, far, size=(2, 21, 3))) for far in (1.0, 2.0)]
+    both = jax.tree.map(lambda *x: jnp.stack(x), *both)
+    rewards = decomposition.bound(draw(3, 2, config), both, both, config)
+    fitted = rewards._replace(task_range=None, own_bounds=None)
+
+    def own(rewards, obs, strategy):
+        with_own = decomposition.reward(rewards, None, None, obs, config, strategy)
+        return with_own - decomposition.reward(rewards, None, None, obs, config)
+
+    beyond = jnp.array([[1.5, -1.5, 0.5], [9.0, 0.0, 0.0]])
+    for strategy in range(2):
+        shown = both.obs[strategy, :, 1:].reshape(-1, 3)
+        np.testing.assert_allclose(
+            own(rewards, shown, strategy), own(fitted, shown, strategy), atol=1e-7
+        )
+        edge = jnp.clip(beyond, shown.min(axis=0), shown.max(axis=0))
+        found, expected = own(rewards, beyond, strategy), own(fitted, edge, strategy)
+        np.testing.assert_allclose(found, expected, atol=1e-7)
