@@ -17,7 +17,8 @@ from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.envs import Episode, make_env
 from represent_jax.errors import UsageError, unknown
 from represent_jax.stages import regression
-from represent_jax.stages.regression_config import RegressionConfig, RegressionData
+from represent_jax.stages.regression import RegressionData
+from represent_jax.stages.regression_config import RegressionConfig
 
 _OBS_DIM, _ACTION_DIM, _HORIZON = 17, 6, 1_000  # HalfCheetah's
 _UPDATES = 5
