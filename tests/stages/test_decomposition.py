@@ -3,12 +3,12 @@
 import dataclasses
 import functools
 
+import batches
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.errors import UsageError
 from represent_jax.stages import decomposition
 from represent_jax.stages.regression_config import RegressionConfig
@@ -19,20 +19,6 @@ CONFIG = RegressionConfig(hidden_sizes=(16, 16), kernel_scale=0.1)
 def draw(obs_dim, num_strategies, config):
     keys = jax.random.split(jax.random.PRNGKey(0))
     return decomposition.draw(*keys, obs_dim, 1, num_strategies, config)
-
-
-def _batch(obs, lengths=None):
-    num, steps_plus_one, _ = obs.shape
-    horizon = steps_plus_one - 1
-    lengths = np.full(num, horizon) if lengths is None else np.asarray(lengths)
-    return TrajectoryBatch(
-        obs=jnp.asarray(obs, jnp.float32),
-        actions=jnp.zeros((num, horizon, 1)),
-        rewards=jnp.zeros((num, horizon)),
-        mask=jnp.asarray(np.arange(horizon) < lengths[:, None], jnp.float32),
-        strategy=jnp.zeros(num, jnp.int32),
-        noise_level=jnp.zeros(num),
-    )
 
 
 def test_reward_is_task_plus_weighted_strategy():
@@ -73,7 +59,7 @@ def test_task_entries_outside_the_observation_are_refused():
 
 def test_bounded_rewards_pay_nothing_for_going_beyond_what_was_rolled_out():
     config = dataclasses.replace(CONFIG, input_quantile=1.0)
-    noisy = _batch(np.random.default_rng(0).normal(size=(3, 21, 2)), lengths=[19, 19, 19])
+    noisy = batches.make(np.random.default_rng(0).normal(size=(3, 21, 2)), lengths=[19, 19, 19])
     # Past the end of an episode nothing was rolled out.
     noisy = jax.tree.map(lambda x: x[None], noisy._replace(obs=noisy.obs.at[:, -1].set(1e6)))
     rewards = decomposition.bound(draw(2, 1, config), noisy, noisy, config)
@@ -96,8 +82,8 @@ def test_the_task_reward_falls_beyond_what_was_demonstrated(quantile):
         CONFIG, task_entries=(0, 2), within_demonstrations=True, input_quantile=quantile
     )
     random = np.random.default_rng(0)
-    noisy = _batch(random.uniform(-3.0, 3.0, size=(3, 21, 3)))
-    demonstrations = _batch(random.uniform(-1.0, 1.0, size=(2, 21, 3)) * [1.0, 1.0, 0.5])
+    noisy = batches.make(random.uniform(-3.0, 3.0, size=(3, 21, 3)))
+    demonstrations = batches.make(random.uniform(-1.0, 1.0, size=(2, 21, 3)) * [1.0, 1.0, 0.5])
     noisy, alone = (jax.tree.map(lambda x: x[None], one) for one in (noisy, demonstrations))
     rewards = decomposition.bound(draw(3, 1, config), noisy, alone, config)
     fitted = rewards._replace(task_range=None, own_bounds=None)
@@ -131,7 +117,7 @@ def test_a_strategy_is_paid_for_nothing_that_it_did_not_show():
     config = dataclasses.replace(CONFIG, within_demonstrations=True)
     random = np.random.default_rng(0)
     # The second strategy goes twice as far.
-    both = [_batch(random.uniform(-far, far, size=(2, 21, 3))) for far in (1.0, 2.0)]
+    both = [batches.make(random.uniform(-far, far, size=(2, 21, 3))) for far in (1.0, 2.0)]
     both = jax.tree.map(lambda *x: jnp.stack(x), *both)
     rewards = decomposition.bound(draw(3, 2, config), both, both, config)
     fitted = rewards._replace(task_range=None, own_bounds=None)

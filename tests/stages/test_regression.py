@@ -2,12 +2,12 @@
 
 import dataclasses
 
+import batches
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.errors import UsageError
 from represent_jax.stages import decomposition, evaluation, regression
 from represent_jax.stages.regression import RegressionData
@@ -25,20 +25,6 @@ CONFIG = RegressionConfig(
     kernel_scale=0.1,
     l2=0.0,
 )
-
-
-def _batch(obs, lengths=None):
-    num, steps_plus_one, _ = obs.shape
-    horizon = steps_plus_one - 1
-    lengths = np.full(num, horizon) if lengths is None else np.asarray(lengths)
-    return TrajectoryBatch(
-        obs=jnp.asarray(obs, jnp.float32),
-        actions=jnp.zeros((num, horizon, 1)),
-        rewards=jnp.zeros((num, horizon)),
-        mask=jnp.asarray(np.arange(horizon) < lengths[:, None], jnp.float32),
-        strategy=jnp.zeros(num, jnp.int32),
-        noise_level=jnp.zeros(num),
-    )
 
 
 def test_ssrr_loss_of_constant_rewards_is_the_squared_error():
@@ -63,7 +49,7 @@ def test_snippets_never_leave_the_running_steps_and_count_the_nominal_horizon():
     obs = np.tile(np.arange(horizon + 1.0)[None, :, None], (3, 1, 1))
     snippets = regression.sample_snippets(
         jax.random.PRNGKey(0),
-        _batch(obs, lengths),
+        batches.make(obs, lengths),
         jnp.array([0.1, 0.2, 0.3]),
         dataclasses.replace(CONFIG, num_snippets=500),
     )
@@ -110,7 +96,7 @@ def test_known_reward_is_recovered_and_decomposed():
     for strategy, place in enumerate((-1.0, 1.0)):
         noise = 0.3 * jax.random.normal(jax.random.fold_in(key, strategy), (num, horizon + 1, 2))
         centre = jnp.stack([levels, jnp.full(num, place)], axis=-1)
-        data.append(_batch(centre[:, None] + noise))
+        data.append(batches.make(centre[:, None] + noise))
     noisy = jax.tree.map(lambda *x: jnp.stack(x), *data)
     demonstrations = jax.tree.map(lambda x: x[:, :4], noisy)
     problem = RegressionData(noisy, jnp.stack([levels, levels]), demonstrations)
@@ -141,7 +127,7 @@ def test_a_strategy_that_is_twice_as_good_gets_twice_the_unit():
     for strategy, best in enumerate((1.0, 2.0)):
         noise = 0.1 * jax.random.normal(jax.random.fold_in(key, strategy), (num, horizon + 1, 2))
         centre = jnp.stack([best * levels, jnp.zeros(num)], axis=-1)
-        data.append(_batch(centre[:, None] + noise))
+        data.append(batches.make(centre[:, None] + noise))
     noisy = jax.tree.map(lambda *x: jnp.stack(x), *data)
     problem = RegressionData(noisy, jnp.stack([levels, levels]), noisy)
     state = regression.init(jax.random.PRNGKey(1), 2, 1, 2, config)
@@ -154,7 +140,7 @@ def test_a_strategy_that_is_twice_as_good_gets_twice_the_unit():
 
 def test_step_is_the_same_without_jit():
     obs = np.random.default_rng(0).normal(size=(1, 3, 21, 2))
-    noisy = jax.tree.map(lambda x: x[None], _batch(obs[0]))
+    noisy = jax.tree.map(lambda x: x[None], batches.make(obs[0]))
     problem = RegressionData(noisy, jnp.ones((1, 3)), noisy)
     state = regression.init(jax.random.PRNGKey(0), 2, 1, 1, CONFIG)
     compiled, _ = jax.jit(lambda state: regression.step(state, problem, CONFIG))(state)
