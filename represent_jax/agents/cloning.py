@@ -19,6 +19,7 @@ def clone(
     log_prob: Callable[[PolicyParams, jax.Array, jax.Array], jax.Array],
     demonstrations: Transition,
     num_updates: int,
+    observation_noise: float = 0.0,
     batch_size: int = 256,
     learning_rate: float = 1e-3,
 ) -> PolicyParams:
@@ -30,6 +31,9 @@ def clone(
       log_prob: `log_prob(policy, obs_t, action_t)`, log density of actions, `[batch]`.
       demonstrations: `[num_transitions]`.
       num_updates: Adam steps, with the step size falling to zero along a cosine.
+      observation_noise: standard deviation of Gaussian noise on what the policy sees while it
+        learns, in units of observations: a clone of few demonstrations then knows what to do
+        beside them too.
       batch_size: transitions in each.
       learning_rate: Adam's first step size.
     """
@@ -43,6 +47,9 @@ def clone(
         networks, opt = carry
         index = jax.random.randint(key, (batch_size,), 0, demonstrations.reward_t.shape[0])
         rows = jax.tree.map(lambda x: x[index], demonstrations)
+        if observation_noise:
+            noise = jax.random.normal(jax.random.fold_in(key, 1), rows.obs_t.shape)
+            rows = rows._replace(obs_t=rows.obs_t + observation_noise * noise)
         updates, opt = optimizer.update(jax.grad(loss_fn)(networks, rows), opt)
         return (optax.apply_updates(networks, updates), opt), None
 

@@ -18,7 +18,7 @@ from represent_jax.agents import cloning, ppo, replay, sac
 from represent_jax.agents.ppo import PpoConfig
 from represent_jax.agents.registry import find_agent
 from represent_jax.agents.sac import PolicyParams, SacConfig
-from represent_jax.config import require
+from represent_jax.config import later, require
 from represent_jax.envs.episode import Episode
 from represent_jax.stages import discriminator
 from represent_jax.stages.discriminator import DiscriminatorConfig, DiscriminatorState, RewardParams
@@ -37,6 +37,7 @@ class AirlConfig:
       agent: the generator, "sac" or "ppo".
       cloning_updates: updates of behavioural cloning that the generator starts from; 0 starts it
         from random networks, and so do demonstrations of states alone.
+      cloning_noise: standard deviation of noise on the observations that are cloned from.
       noisy: whether training environments have the noise levels of SSRR (Noisy-AIRL).
       reward_scale: factor on f where it rewards the generator.
       reward_clip: bound on f where it rewards the generator.
@@ -49,6 +50,7 @@ class AirlConfig:
     env_steps: int = 240_000
     agent: str = "sac"
     cloning_updates: int = 2_000
+    cloning_noise: float = later(0.0)
     noisy: bool = True
     reward_scale: float = 0.5
     reward_clip: float = 10.0
@@ -60,7 +62,8 @@ class AirlConfig:
     def __post_init__(self) -> None:
         require(self.env_steps >= 1, "env_steps", "at least 1", self.env_steps)
         find_agent(self.agent)
-        require(self.cloning_updates >= 0, "cloning_updates", ">= 0", self.cloning_updates)
+        for field in ("cloning_updates", "cloning_noise"):
+            require(getattr(self, field) >= 0, field, ">= 0", getattr(self, field))
         rate = self.policy_average_rate
         require(0.0 < rate <= 1.0, "policy_average_rate", "in (0, 1]", rate)
         # A clone is fitted before there are statistics, which would then move under its feet.
@@ -114,7 +117,14 @@ def init(key: jax.Array, env: Episode, demonstrations: Transition, config: AirlC
         def log_prob(params, obs_t, action_t):
             return module.log_prob(params, obs_t, action_t, settings)
 
-        policy = cloning.clone(key_clone, random, log_prob, demonstrations, config.cloning_updates)
+        policy = cloning.clone(
+            key_clone,
+            random,
+            log_prob,
+            demonstrations,
+            config.cloning_updates,
+            config.cloning_noise,
+        )
     agent = module.init(key_agent, env, settings, start, policy)
     return AirlState(
         agent=agent,

@@ -29,7 +29,7 @@ from flax import linen, struct
 
 from represent_jax.agents import cloning, replay, sac
 from represent_jax.agents.sac import PolicyParams, SacConfig
-from represent_jax.config import require
+from represent_jax.config import later, require
 from represent_jax.envs.episode import Episode
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.discriminator import INPUT_CLIP, Rows, gradient_penalty, logits
@@ -44,6 +44,7 @@ class MsrdConfig:
       env_steps: budget of each strategy.
       cloning_updates: updates of behavioural cloning that each generator starts from; 0 starts it
         from random networks, and so do demonstrations of states alone.
+      cloning_noise: standard deviation of noise on the observations that are cloned from.
       hidden_sizes: units of the hidden layers of R^0, R~_i and h_i.
       learning_rate: AdamW step size of R~_i and h_i.
       task_learning_rate: that of R^0, which makes one step in a training step.
@@ -64,6 +65,7 @@ class MsrdConfig:
 
     env_steps: int = 240_000
     cloning_updates: int = 2_000
+    cloning_noise: float = later(0.0)
     hidden_sizes: tuple[int, ...] = (64, 64)
     learning_rate: float = 3e-4
     task_learning_rate: float = 3e-4
@@ -86,7 +88,10 @@ class MsrdConfig:
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
         for field in ("learning_rate", "task_learning_rate", "log_prob_clip", "reward_clip"):
             require(getattr(self, field) > 0.0, field, "positive", getattr(self, field))
-        for field in ("cloning_updates", "gradient_penalty", "strategy_l2", "task_l2"):
+        for field in (
+            *("cloning_updates", "cloning_noise"),
+            *("gradient_penalty", "strategy_l2", "task_l2"),
+        ):
             require(getattr(self, field) >= 0, field, ">= 0", getattr(self, field))
         rate = self.policy_average_rate
         require(0.0 < rate <= 1.0, "policy_average_rate", "in (0, 1]", rate)
@@ -198,7 +203,14 @@ def _init_agent(key, env, demonstrations, config):
         def log_prob(params, obs_t, action_t):
             return sac.log_prob(params, obs_t, action_t, config.sac)
 
-        policy = cloning.clone(key_clone, random, log_prob, demonstrations, config.cloning_updates)
+        policy = cloning.clone(
+            key_clone,
+            random,
+            log_prob,
+            demonstrations,
+            config.cloning_updates,
+            config.cloning_noise,
+        )
     return sac.init(key_agent, env, config.sac, policy_params=policy)
 
 
