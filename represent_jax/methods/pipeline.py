@@ -112,8 +112,10 @@ def run_noise(
 ) -> noise.NoisyData:
     """Phase 2's rollouts; leaves of the result are `[num_strategies, ...]`."""
 
+    mode = config.noise.actions == "mode"
+
     def policy(params, obs_t, key):
-        return airl.act(params, obs_t, key, config.airl, problem.env.action_size)
+        return airl.act(params, obs_t, key, config.airl, problem.env.action_size, mode)
 
     def reward(params, obs_t, action_t, next_obs_t):
         return airl.reward(params, obs_t, action_t, next_obs_t, config.airl)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from represent_jax.agents import rollout as rollouts
-from represent_jax.config import require
+from represent_jax.config import later, require
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.envs.episode import Episode
 from represent_jax.types import Params, PolicyFn, RewardFn
@@ -25,11 +25,14 @@ class NoiseConfig:
       num_levels: number of noise levels.
       level_step: distance between two levels; the first is 0.
       trajectories_per_level: episodes at each level.
+      actions: what Phase 1's policy does where noise lets it: "sampled" actions, as SSRR's does, or
+        their "mode".
     """
 
     num_levels: int = 20
     level_step: float = 0.05
     trajectories_per_level: int = 5
+    actions: str = later("sampled")
 
     def __post_init__(self) -> None:
         require(self.num_levels >= 5, "num_levels", "at least 5", self.num_levels)
@@ -39,6 +42,7 @@ class NoiseConfig:
             "at least 1",
             self.trajectories_per_level,
         )
+        require(self.actions in ("mode", "sampled"), "actions", "'mode' or 'sampled'", self.actions)
         highest = self.level_step * (self.num_levels - 1)
         require(0.0 < highest <= 1.0, "level_step", "highest level in (0, 1]", highest)
 
