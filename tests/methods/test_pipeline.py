@@ -77,6 +77,23 @@ def test_curves_are_of_the_floored_returns_unless_told_otherwise(given):
     np.testing.assert_allclose(curves.scaled_returns, (typical - low) / (high - low), atol=1e-5)
 
 
+@pytest.mark.parametrize("actions", ["mode", "sampled"])
+def test_rollouts_without_noise_are_of_the_mode_or_of_samples(given, tmp_path, actions):
+    problem, first, _, _ = given
+    config = dataclasses.replace(CONFIG, noise=dataclasses.replace(CONFIG.noise, actions=actions))
+    with open_run(tmp_path / "run", config) as run:
+        noisy = pipeline.run_noise(jax.random.PRNGKey(3), config, problem, first, run)
+    clean = jax.tree.map(lambda x: x[:, : CONFIG.noise.trajectories_per_level], noisy.trajectories)
+
+    def mode_of(policy, obs_t):
+        key = jax.random.PRNGKey(0)
+        return airl.act(policy, obs_t, key, CONFIG.airl, problem.env.action_size, True)
+
+    modes = jax.vmap(mode_of)(first.policy, clean.obs[..., :-1, :])
+    off = float(jnp.max(jnp.abs(clean.actions - modes)))
+    assert off < 1e-4 if actions == "mode" else off > 0.01
+
+
 def test_bounded_rewards_are_found_again(given, tmp_path):
     problem, first, noisy, _ = given
     bounded = dataclasses.replace(

@@ -303,6 +303,7 @@ def test_training_counts_its_steps_bounds_rewards_and_hands_on_averages(
         ("task_learning_rate", 0.0),
         ("strategy_l2", -1.0),
         ("cloning_updates", -1),
+        ("cloning_noise", -0.1),
         ("policy_average_rate", 0.0),
     ],
 )
