@@ -111,7 +111,6 @@ def run_noise(
     directory: RunDirectory,
 ) -> noise.NoisyData:
     """Phase 2's rollouts; leaves of the result are `[num_strategies, ...]`."""
-
     mode = config.noise.actions == "mode"
 
     def policy(params, obs_t, key):
