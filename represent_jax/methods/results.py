@@ -164,6 +164,9 @@ def judge_rewards(
 ) -> dict[str, Any]:
     """Correlates learned with true returns, and saves the points for figures.
 
+    `task_share`, for which no true return is needed, is how much of what R^i knows of its own noisy
+    rollouts is R^0's: near 1 where R~^i holds a style and nothing else.
+
     Args:
       problem: holds the demonstrations and the unseen test trajectories, as far as given.
       noisy: the noisy rollouts that rewards were trained on, by name ("noisy_1", ...).
@@ -189,6 +192,10 @@ def judge_rewards(
             **(_correlations("noisy", true, found, list(noisy)) if noisy else {}),
             **(_correlations("pooled", true, found, list(groups)) if groups else {}),
         }
+        own = name.replace("strategy_", "noisy_")
+        if "task" in learned and own != name and own in noisy:
+            shared = scatter[f"task/{own}/learned"]
+            results[name]["task_share"] = float(evaluation.slope(found[own], shared))
         if problem.test and problem.demonstrations.has_rewards:
             above = true["test"] > max(t.total_reward for t in demonstrations)
             results[name]["pearson_above_demonstrators"] = (

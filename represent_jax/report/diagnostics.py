@@ -43,6 +43,7 @@ def verdicts(
     found = [
         imitation(results),
         noise_curve(results),
+        sharing(results),
         unseen(results),
         extrapolation(results),
         improvement(results),
@@ -97,6 +98,25 @@ def noise_curve(results: Mapping[str, Any]) -> Verdict | None:
         "along a sigmoid, so the ranking that Phase 3 learns from is weak.",
     }
     return _verdict("Does the noise curve fall, and fit?", graded, sentences, details)
+
+
+def sharing(results: Mapping[str, Any]) -> Verdict | None:
+    """Does the task reward hold what the strategies share? Needs no true return."""
+    shares = _of_rewards(results, "task_share")
+    sentences = {
+        GOOD: "Yes: R\N{SUPERSCRIPT ZERO} explains the noisy rollouts, the strategies' own rewards "
+        "add what is theirs.",
+        FAIR: "Mostly: a strategy's own reward also holds some of the task, so it may judge other "
+        "styles too low. A larger regression.lambda_reg leaves more to R\N{SUPERSCRIPT ZERO}.",
+        POOR: "No: a strategy's own reward holds as much of the task as R\N{SUPERSCRIPT ZERO}, and "
+        "judges other styles too low. Raise regression.lambda_reg.",
+    }
+    graded = {t: _grade(share, 0.8, 0.6) for t, share in shares.items()}
+    details = {
+        t: f"{100 * share:.0f} % of what its reward knows of its noisy rollouts"
+        for t, share in shares.items()
+    }
+    return _verdict("Does the task reward hold what is shared?", graded, sentences, details)
 
 
 def unseen(results: Mapping[str, Any]) -> Verdict | None:
@@ -190,12 +210,17 @@ def _correlations(
     bounds: tuple[float, float],
     sentences: Mapping[str, str],
 ) -> Verdict | None:
-    rewards = results.get("rewards") or {}
-    values = {t: rewards[t].get(key) for t in targets(results) if rewards.get(t)}
-    values = {t: v for t, v in values.items() if v is not None and math.isfinite(v)}
+    values = _of_rewards(results, key)
     graded = {t: _grade(v, *bounds) for t, v in values.items()}
     details = {t: f"r = {format_correlation(v)}" for t, v in values.items()}
     return _verdict(question, graded, sentences, details)
+
+
+def _of_rewards(results: Mapping[str, Any], key: str) -> dict[str, float]:
+    """Returns what is known of each reward, by target."""
+    rewards = results.get("rewards") or {}
+    values = {t: rewards[t].get(key) for t in targets(results) if rewards.get(t)}
+    return {t: v for t, v in values.items() if v is not None and math.isfinite(v)}
 
 
 def _verdict(

@@ -1,4 +1,4 @@
-"""How well a learned reward orders trajectories by their true return."""
+"""How returns of the same trajectories agree: learned with true, one reward's with another's."""
 
 from typing import NamedTuple
 
@@ -33,6 +33,15 @@ def pearson(a: jax.Array, b: jax.Array) -> jax.Array:
     """Pearson's correlation of two vectors, `[]`."""
     a, b = a - jnp.mean(a), b - jnp.mean(b)
     return jnp.sum(a * b) / jnp.sqrt(jnp.sum(a * a) * jnp.sum(b * b))
+
+
+def slope(a: jax.Array, b: jax.Array) -> jax.Array:
+    """By how much `b` rises for one unit of `a`, by least squares, `[]`; both `[num]`.
+
+    NaN where `a` is constant.
+    """
+    a = a - jnp.mean(a)
+    return jnp.sum(a * b) / jnp.sum(a * a)
 
 
 def _ranks(values: jax.Array) -> jax.Array:

@@ -15,6 +15,7 @@ import represent_jax as rj
 from represent_jax.config import apply_overrides
 from represent_jax.data import formats, save_demonstrations
 from represent_jax.data.catalogue import load_test
+from represent_jax.data.trajectories import pad
 from represent_jax.errors import UsageError
 from represent_jax.methods import results
 from represent_jax.methods.config import make_problem
@@ -111,6 +112,19 @@ def test_rewards_are_judged_by_what_is_known(tmp_path, env, shown, has_rewards, 
     text = tables.summary(said | {"rewards": {"task": found}})
     assert ("no true rewards" in text) is not has_rewards
     assert ("no unseen trajectories" in text) is not has_test
+
+
+def test_the_share_of_the_task_needs_no_true_return(tmp_path, env, shown):
+    problem = make_problem(make_config("smoke", ENV), env, without(shown, "rewards"), None)
+    noisy = pad(shown.trajectories, 1_000)
+    learned = {
+        "task": lambda batch: 1.0 + 0.6 * first_of_obs(batch),
+        "strategy_1": first_of_obs,
+        "strategy_2": first_of_obs,
+    }
+    found = results.judge_rewards(problem, {"noisy_1": noisy}, learned, RunDirectory(tmp_path))
+    assert found["strategy_1"]["task_share"] == pytest.approx(0.6, abs=1e-4)
+    assert "task_share" not in found["task"] | found["strategy_2"]
 
 
 LAUNCH = """

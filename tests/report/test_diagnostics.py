@@ -9,7 +9,7 @@ from represent_jax.report.diagnostics import FAIR, GOOD, POOR
 
 def test_a_good_run_is_good_throughout(results, learning):
     verdicts = diagnostics.verdicts(results, learning)
-    assert [verdict.level for verdict in verdicts] == [GOOD] * 6
+    assert [verdict.level for verdict in verdicts] == [GOOD] * 7
     assert all(verdict.sentence.startswith("Yes") for verdict in verdicts)
 
 
@@ -48,6 +48,19 @@ def test_imitation_of_negative_returns(results):
 def test_noise_curve(results, changes, level):
     results["curve"][1] = results["curve"][1] | changes
     assert diagnostics.noise_curve(results).level == level
+
+
+@pytest.mark.parametrize(("share", "level"), [(0.85, GOOD), (0.7, FAIR), (0.5, POOR)])
+def test_how_much_of_the_task_is_the_task_rewards(results, share, level):
+    results["rewards"]["strategy_2"] = {"task_share": share}
+    verdict = diagnostics.sharing(results)
+    assert verdict.level == level
+    assert verdict.details[-1].startswith(f"Strategy 2: {100 * share:.0f} %")
+
+
+def test_rewards_without_a_shared_part_are_not_asked_for_it(results):
+    results["rewards"] = {"task": {"pearson_test": 0.9}}
+    assert diagnostics.sharing(results) is None
 
 
 def test_correlations(results):
