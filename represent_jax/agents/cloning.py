@@ -1,16 +1,54 @@
 """Behavioural cloning: maximum likelihood of demonstrated actions."""
 
 from collections.abc import Callable
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from represent_jax.agents.sac import PolicyParams
+from represent_jax.agents.ppo import PpoConfig
+from represent_jax.agents.sac import PolicyParams, SacConfig
+from represent_jax.envs.episode import Episode
 from represent_jax.types import Transition
 
 # Saturated actions are infinitely far away before the tanh.
 _LARGEST_ACTION = 0.999
+
+
+def start(
+    key_policy: jax.Array,
+    key_clone: jax.Array,
+    module: ModuleType,
+    settings: SacConfig | PpoConfig,
+    env: Episode,
+    demonstrations: Transition,
+    num_updates: int,
+    observation_noise: float = 0.0,
+) -> PolicyParams | None:
+    """The policy that an agent begins from: a clone of the demonstrations.
+
+    Args:
+      key_policy: PRNG key of the networks that the clone begins from.
+      key_clone: PRNG key of cloning.
+      module: the agent's module, `agents.sac` or `agents.ppo`.
+      settings: the agent's.
+      env: tells sizes.
+      demonstrations: `[num_transitions]`.
+      num_updates, observation_noise: see `clone`.
+
+    Returns:
+      None where there is nothing to clone, or no update to do it with.
+    """
+    if not num_updates or demonstrations.action_t is None:
+        return None
+    learner = module.init_learner(key_policy, env.observation_size, env.action_size, settings)
+
+    def log_prob(params, obs_t, action_t):
+        return module.log_prob(params, obs_t, action_t, settings)
+
+    policy = module.policy_of(learner)
+    return clone(key_clone, policy, log_prob, demonstrations, num_updates, observation_noise)
 
 
 def clone(
@@ -53,6 +91,6 @@ def clone(
         updates, opt = optimizer.update(jax.grad(loss_fn)(networks, rows), opt)
         return (optax.apply_updates(networks, updates), opt), None
 
-    start = (policy.policy, optimizer.init(policy.policy))
-    (networks, _), _ = jax.lax.scan(update, start, jax.random.split(key, num_updates))
+    carry = (policy.policy, optimizer.init(policy.policy))
+    (networks, _), _ = jax.lax.scan(update, carry, jax.random.split(key, num_updates))
     return policy._replace(policy=networks)

@@ -109,22 +109,16 @@ def init(key: jax.Array, env: Episode, demonstrations: Transition, config: AirlC
     levels = jnp.asarray(TRAINING_NOISE_LEVELS if config.noisy else (0.0,))
     levels = jnp.resize(levels, (settings.num_envs,))
     start = jax.vmap(env.reset)(jax.random.split(key_reset, settings.num_envs), levels)
-    policy = None
-    if config.cloning_updates and demonstrations.action_t is not None:
-        sizes = (env.observation_size, env.action_size)
-        random = module.policy_of(module.init_learner(key_policy, *sizes, settings))
-
-        def log_prob(params, obs_t, action_t):
-            return module.log_prob(params, obs_t, action_t, settings)
-
-        policy = cloning.clone(
-            key_clone,
-            random,
-            log_prob,
-            demonstrations,
-            config.cloning_updates,
-            config.cloning_noise,
-        )
+    policy = cloning.start(
+        key_policy,
+        key_clone,
+        module,
+        settings,
+        env,
+        demonstrations,
+        config.cloning_updates,
+        config.cloning_noise,
+    )
     agent = module.init(key_agent, env, settings, start, policy)
     return AirlState(
         agent=agent,

@@ -195,22 +195,16 @@ def init(key: jax.Array, env: Episode, demonstrations: Transition, config: MsrdC
 
 def _init_agent(key, env, demonstrations, config):
     key_agent, key_policy, key_clone = jax.random.split(key, 3)
-    policy = None
-    if config.cloning_updates and demonstrations.action_t is not None:
-        sizes = (env.observation_size, env.action_size)
-        random = sac.policy_of(sac.init_learner(key_policy, *sizes, config.sac))
-
-        def log_prob(params, obs_t, action_t):
-            return sac.log_prob(params, obs_t, action_t, config.sac)
-
-        policy = cloning.clone(
-            key_clone,
-            random,
-            log_prob,
-            demonstrations,
-            config.cloning_updates,
-            config.cloning_noise,
-        )
+    policy = cloning.start(
+        key_policy,
+        key_clone,
+        sac,
+        config.sac,
+        env,
+        demonstrations,
+        config.cloning_updates,
+        config.cloning_noise,
+    )
     return sac.init(key_agent, env, config.sac, policy_params=policy)
 
 
