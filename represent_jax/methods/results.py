@@ -181,9 +181,12 @@ def judge_rewards(
         groups["test"] = pad(problem.test, problem.env.horizon)
     groups |= noisy
     true = {name: np.asarray(rollouts.true_returns(batch)) for name, batch in groups.items()}
+    judged = {
+        name: {group: np.asarray(learned_of(batch)) for group, batch in groups.items()}
+        for name, learned_of in learned.items()
+    }
     results, scatter = {}, {}
-    for name, learned_of in learned.items():
-        found = {group: np.asarray(learned_of(batch)) for group, batch in groups.items()}
+    for name, found in judged.items():
         for group in groups:
             scatter[f"{name}/{group}/true"] = true[group]
             scatter[f"{name}/{group}/learned"] = found[group]
@@ -193,9 +196,9 @@ def judge_rewards(
             **(_correlations("pooled", true, found, list(groups)) if groups else {}),
         }
         own = name.replace("strategy_", "noisy_")
-        if "task" in learned and own != name and own in noisy:
-            shared = scatter[f"task/{own}/learned"]
-            results[name]["task_share"] = float(evaluation.slope(found[own], shared))
+        if "task" in judged and own != name and own in noisy:
+            share = evaluation.slope(found[own], judged["task"][own])
+            results[name]["task_share"] = float(share)
         if problem.test and problem.demonstrations.has_rewards:
             above = true["test"] > max(t.total_reward for t in demonstrations)
             results[name]["pearson_above_demonstrators"] = (
