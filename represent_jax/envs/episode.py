@@ -22,10 +22,18 @@ class Episode(base.Env):
       env: the environment inside.
       horizon: steps after which an episode is cut off.
       auto_reset: whether a new episode follows at once; without it the caller masks.
+      noise_size: random actions are uniform in [-noise_size, noise_size].
     """
 
-    def __init__(self, env: base.Env, horizon: int | None = None, auto_reset: bool = True):
+    def __init__(
+        self,
+        env: base.Env,
+        horizon: int | None = None,
+        auto_reset: bool = True,
+        noise_size: float = 1.0,
+    ):
         self.env = env
+        self.noise_size = noise_size
         self.horizon = env.horizon if horizon is None else horizon
         self.auto_reset = auto_reset
 
@@ -70,7 +78,8 @@ class Episode(base.Env):
         noise_level = state.info["noise_level"]
         executed = jnp.where(
             jax.random.uniform(key_replace) < noise_level,
-            jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0),
+            self.noise_size
+            * jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0),
             action,
         )
         after = self.env.step(state, executed)

@@ -135,7 +135,7 @@ def run_rollouts(
     directory: RunDirectory,
 ) -> noise.NoisyData:
     """Noisy rollouts of any policies; parameters and result are `[num_policies, ...]`."""
-    whole = Episode(env.env, env.horizon, auto_reset=False)
+    whole = Episode(env.env, env.horizon, auto_reset=False, noise_size=config.action_size)
 
     def one(key, policy_params, reward_params):
         return noise.run(key, whole, policy, policy_params, reward_fn, reward_params, config)

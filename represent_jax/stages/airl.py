@@ -38,6 +38,8 @@ class AirlConfig:
       cloning_updates: updates of behavioural cloning that the generator starts from; 0 starts it
         from random networks, and so do demonstrations of states alone.
       cloning_noise: standard deviation of noise on the observations that are cloned from.
+      learn_policy: whether the generator learns; otherwise it stays the clone it began as, and only
+        the discriminator learns, to tell that clone from the demonstrations.
       noisy: whether training environments have the noise levels of SSRR (Noisy-AIRL).
       reward_scale: factor on f where it rewards the generator.
       reward_clip: bound on f where it rewards the generator.
@@ -51,6 +53,7 @@ class AirlConfig:
     agent: str = "sac"
     cloning_updates: int = 2_000
     cloning_noise: float = later(0.0)
+    learn_policy: bool = later(True)
     noisy: bool = True
     reward_scale: float = 0.5
     reward_clip: float = 10.0
@@ -66,6 +69,12 @@ class AirlConfig:
             require(getattr(self, field) >= 0, field, ">= 0", getattr(self, field))
         rate = self.policy_average_rate
         require(0.0 < rate <= 1.0, "policy_average_rate", "in (0, 1]", rate)
+        require(
+            self.learn_policy or self.cloning_updates > 0,
+            "cloning_updates",
+            "above 0 where learn_policy=false",
+            self.cloning_updates,
+        )
         # A clone is fitted before there are statistics, which would then move under its feet.
         require(
             not (self.cloning_updates and generator(self)[1].normalize_observations),
@@ -153,12 +162,14 @@ def _step_off_policy(state, env, demonstrations, config):
     learned, metrics = _discriminate(
         key_rows, state.discriminator, agent, demonstrations, replayed, config
     )
+    env_reward = jnp.mean(transitions.reward_t)
+    if not config.learn_policy:
+        return agent, learned, {**metrics, "env_reward": env_reward}
     agent, batches = sac.draw(agent, env, config.sac)
     f_t = _bounded_advantage(learned.params, batches, config)
     # AIRL's reward is f - log pi. Its second half is the entropy that SAC adds by itself; written
     # into the rewards of replayed actions it would favour those the policy has left behind.
     agent, agent_metrics = sac.learn(agent, batches._replace(reward_t=f_t), config.sac)
-    env_reward = jnp.mean(transitions.reward_t)
     return agent, learned, {**agent_metrics, **metrics, "env_reward": env_reward}
 
 
@@ -173,13 +184,15 @@ def _step_on_policy(state, env, demonstrations, config):
     learned, metrics = _discriminate(
         key_rows, state.discriminator, agent, demonstrations, rows, config
     )
+    env_reward = jnp.mean(transitions.reward_t)
+    if not config.learn_policy:
+        return agent, learned, {**metrics, "env_reward": env_reward}
     # The actions are the policy's own, so that f - log pi is worth what AIRL says.
     f_t = _bounded_advantage(learned.params, transitions, config)
     log_prob_t = discriminator.bounded_log_prob(rollout.log_prob_t, config.discriminator)
     reward_t = f_t - config.reward_scale * log_prob_t
     rollout = rollout._replace(transitions=transitions._replace(reward_t=reward_t))
     agent, agent_metrics = ppo.learn(agent, rollout, config.ppo)
-    env_reward = jnp.mean(transitions.reward_t)
     return agent, learned, {**agent_metrics, **metrics, "env_reward": env_reward}
 
 

@@ -27,12 +27,14 @@ class NoiseConfig:
       trajectories_per_level: episodes at each level.
       actions: what Phase 1's policy does where noise lets it: "sampled" actions, as SSRR's does, or
         their "mode".
+      action_size: random actions are uniform in [-action_size, action_size]; 1 is all there is.
     """
 
     num_levels: int = 20
     level_step: float = 0.05
     trajectories_per_level: int = 5
     actions: str = later("sampled")
+    action_size: float = later(1.0)
 
     def __post_init__(self) -> None:
         require(self.num_levels >= 5, "num_levels", "at least 5", self.num_levels)
@@ -43,6 +45,7 @@ class NoiseConfig:
             self.trajectories_per_level,
         )
         require(self.actions in ("mode", "sampled"), "actions", "'mode' or 'sampled'", self.actions)
+        require(0.0 < self.action_size <= 1.0, "action_size", "in (0, 1]", self.action_size)
         highest = self.level_step * (self.num_levels - 1)
         require(0.0 < highest <= 1.0, "level_step", "highest level in (0, 1]", highest)
 

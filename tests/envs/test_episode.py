@@ -135,6 +135,13 @@ def test_noise_replaces_the_whole_action():
     assert 0.4 < replaced.mean() < 0.6
 
 
+def test_random_actions_are_of_the_size_asked_for():
+    _, _, transitions = roll(Episode(Line(), noise_size=0.2), 200, noise_level=1.0)
+    assert np.all(np.abs(transitions.action_t) <= 0.2)
+    p_value = scipy.stats.kstest(np.ravel(transitions.action_t) / 0.4 + 0.5, "uniform").pvalue
+    assert p_value > 1e-3
+
+
 def test_levels_and_scenes_are_two_nested_axes():
     env = Episode(Line())
     keys = jax.random.split(jax.random.PRNGKey(0), (2, 3))

@@ -89,6 +89,26 @@ def test_the_policy_handed_on_is_the_average(problem):
     )
 
 
+@pytest.mark.parametrize("agent", ["sac", "ppo"])
+def test_a_generator_that_does_not_learn_stays_the_clone(problem, agent):
+    config = dataclasses.replace(SMOKE.airl, agent=agent, learn_policy=False)
+    demonstrations = transitions_of(problem.demonstrations)[0]
+    init = jax.jit(lambda key: airl.init(key, problem.env, demonstrations, config))
+    train = jax.jit(lambda state: airl.train(state, problem.env, demonstrations, config, 3))
+    before = init(jax.random.PRNGKey(0))
+    after, _ = train(before)
+    for a, b in zip(*map(jax.tree.leaves, (before.average, after.average)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+    moved = [
+        not np.array_equal(a, b)
+        for a, b in zip(
+            *(jax.tree.leaves(state.discriminator.params.g) for state in (before, after)),
+            strict=True,
+        )
+    ]
+    assert any(moved)
+
+
 def test_noise_levels_are_those_of_ssrr(problem):
     demonstrations = transitions_of(problem.demonstrations)[0]
     sac = dataclasses.replace(SMOKE.airl.sac, num_envs=10, buffer_capacity=400)
@@ -106,6 +126,8 @@ def test_bad_settings_are_named():
         airl.AirlConfig(agent="td3")
     with pytest.raises(UsageError, match="policy_average_rate"):
         airl.AirlConfig(policy_average_rate=0.0)
+    with pytest.raises(UsageError, match="cloning_updates"):
+        airl.AirlConfig(cloning_updates=0, learn_policy=False)
     normalizing = dataclasses.replace(SMOKE.airl.sac, normalize_observations=True)
     with pytest.raises(UsageError, match="normalize_observations"):
         airl.AirlConfig(sac=normalizing)
