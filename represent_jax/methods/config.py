@@ -165,9 +165,11 @@ class RepresentConfig(MethodConfig):
 
     @property
     def needs_actions(self) -> str:
-        """Rewards that see actions; those of next states alone do without."""
+        """Rewards that see actions, and a policy that stays a clone; others do without."""
         if not self.airl.discriminator.state_only:
             return "airl.discriminator.state_only=false"
+        if not self.airl.learn_policy:
+            return "airl.learn_policy=false"
         return "regression.include_action=true" if self.regression.include_action else ""
 
     def check_against(self, obs_dim: int) -> None:
