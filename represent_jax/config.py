@@ -12,7 +12,7 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
-from represent_jax.errors import UsageError, unknown
+from represent_jax.errors import SettingError, UsageError, unknown
 
 C = TypeVar("C")
 
@@ -20,7 +20,7 @@ _BOOLS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0"
 
 
 def require(condition: bool, field: str, expected: str, found: Any) -> None:
-    """Raises a UsageError naming the field, what it has to be and what it is, unless it holds.
+    """Raises a SettingError naming the field, what it has to be and what it is, unless it holds.
 
     Args:
         condition: whether the field is as it has to be.
@@ -29,10 +29,15 @@ def require(condition: bool, field: str, expected: str, found: Any) -> None:
         found: the value it has.
 
     Raises:
-        UsageError: the condition does not hold.
+        SettingError: the condition does not hold.
     """
     if not condition:
-        raise UsageError(f"{field}: expected {expected}, found {found!r}")
+        raise SettingError(field, f"expected {expected}, found {found!r}")
+
+
+def require_sizes(sizes: tuple[int, ...], field: str = "hidden_sizes") -> None:
+    """Raises a SettingError unless every layer has units."""
+    require(all(size >= 1 for size in sizes), field, "each at least 1", sizes)
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -199,7 +204,11 @@ def _build(cls: type, values: Mapping[str, Any], prefix: str) -> Any:
         if no_default and name not in values:
             raise UsageError(f"{prefix}{name}: expected {_describe(hints[name])}, found nothing")
     found = {key: _convert(value, hints[key], prefix + key) for key, value in values.items()}
-    return cls(**found)
+    try:
+        return cls(**found)
+    except SettingError as error:
+        # A group of settings does not know what it is a part of; several have a `batch_size`.
+        raise SettingError(prefix + error.field, error.complaint) from error
 
 
 def _convert(value: Any, hint: Any, key: str) -> Any:

@@ -24,6 +24,20 @@ class UsageError(RepresentError):
     exit_code = 2
 
 
+class SettingError(UsageError):
+    """A setting is not as it has to be.
+
+    Attributes:
+        field: its name, dotted as far as is known where the error is raised.
+        complaint: what it has to be and what it is.
+    """
+
+    def __init__(self, field: str, complaint: str):
+        super().__init__(f"{field}: {complaint}")
+        self.field = field
+        self.complaint = complaint
+
+
 def unknown(kind: str, name: str, known: Iterable[str]) -> UsageError:
     """Returns the error for a name that is not among the known ones, with the nearest that are.
 

@@ -23,7 +23,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from flax import linen, struct
 
 from represent_jax.agents.sac import PolicyParams, with_reward
-from represent_jax.config import require
+from represent_jax.config import require, require_sizes
 from represent_jax.envs.episode import Episode, transition_of
 from represent_jax.types import Metrics, Params, RewardFn, Transition
 
@@ -71,7 +71,9 @@ class PpoConfig:
             f"a multiple of num_minibatches ({self.num_minibatches})",
             self.num_envs,
         )
-        require(self.learning_rate > 0.0, "learning_rate", "positive", self.learning_rate)
+        for field in ("learning_rate", "reward_scale"):
+            require(getattr(self, field) > 0.0, field, "positive", getattr(self, field))
+        require_sizes(self.hidden_sizes)
         require(0.0 < self.discount < 1.0, "discount", "in (0, 1)", self.discount)
         require(0.0 <= self.gae_lambda <= 1.0, "gae_lambda", "in [0, 1]", self.gae_lambda)
         require(self.clip_epsilon > 0.0, "clip_epsilon", "positive", self.clip_epsilon)

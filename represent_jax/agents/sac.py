@@ -20,7 +20,7 @@ from brax.training.agents.sac import networks as sac_networks
 from flax import struct
 
 from represent_jax.agents import replay
-from represent_jax.config import later, require
+from represent_jax.config import later, require, require_sizes
 from represent_jax.envs.episode import Episode, transition_of
 from represent_jax.types import Metrics, Params, RewardFn, Transition
 
@@ -85,7 +85,7 @@ class SacConfig:
             self.buffer_capacity,
         )
         require(0.0 < self.discount < 1.0, "discount", "in (0, 1)", self.discount)
-        for field in ("learning_rate", "initial_temperature"):
+        for field in ("learning_rate", "initial_temperature", "reward_scale"):
             require(getattr(self, field) > 0.0, field, "positive", getattr(self, field))
         require(
             self.critic_warmup_updates >= 0,
@@ -97,6 +97,7 @@ class SacConfig:
         rate = self.target_update_rate
         require(0.0 < rate <= 1.0, "target_update_rate", "in (0, 1]", rate)
         require(len(self.hidden_sizes) >= 1, "hidden_sizes", "at least one", self.hidden_sizes)
+        require_sizes(self.hidden_sizes)
 
     @property
     def env_steps_per_step(self) -> int:

@@ -33,6 +33,16 @@ class SkillConditioned(base.Env):
         return self.env.backend
 
     @property
+    def horizon(self) -> int:
+        """Steps after which an episode is cut off."""
+        return self.env.horizon
+
+    @property
+    def terminates(self) -> bool:
+        """Whether episodes can end before that."""
+        return self.env.terminates
+
+    @property
     def unwrapped(self) -> base.Env:
         return self.env.unwrapped
 

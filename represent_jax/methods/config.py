@@ -136,14 +136,7 @@ class RepresentConfig(MethodConfig):
         for name in self.policy_targets:
             if name not in self.target_names:
                 raise unknown("policy target", name, self.target_names)
-        if self.policies.start == "phase1":
-            _, settings = airl.generator(self.airl)
-            require(
-                policies.agent_of(self.policies)[1].hidden_sizes == settings.hidden_sizes,
-                f"policies.{self.policies.agent}.hidden_sizes",
-                f"{settings.hidden_sizes}, those of Phase 1's policy, which policies start from",
-                policies.agent_of(self.policies)[1].hidden_sizes,
-            )
+        check_start(self.airl, self.policies)
 
     @property
     def target_names(self) -> tuple[str, ...]:
@@ -174,6 +167,31 @@ class RepresentConfig(MethodConfig):
 
     def check_against(self, obs_dim: int) -> None:
         decomposition.check_entries(self.regression, obs_dim)
+
+
+def check_start(airl_config: AirlConfig, policies_config: PoliciesConfig) -> None:
+    """Raises a SettingError where policies are to start from a Phase 1 policy unlike them."""
+    if policies_config.start != "phase1":
+        return
+    _, first = airl.generator(airl_config)
+    _, settings = policies.agent_of(policies_config)
+    require(
+        settings.hidden_sizes == first.hidden_sizes,
+        f"policies.{policies_config.agent}.hidden_sizes",
+        f"{first.hidden_sizes}, those of Phase 1's policy, which policies start from",
+        settings.hidden_sizes,
+    )
+    # Statistics are gathered anew, and the same networks would see other inputs.
+    for stage, normalizes in (
+        (f"policies.{policies_config.agent}", settings.normalize_observations),
+        (f"airl.{airl_config.agent}", first.normalize_observations),
+    ):
+        require(
+            not normalizes,
+            f"{stage}.normalize_observations",
+            "false where policies.start=phase1",
+            normalizes,
+        )
 
 
 class Problem(NamedTuple):

@@ -19,7 +19,7 @@ from represent_jax.config import require
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.envs import Environment
 from represent_jax.methods import cloning, pipeline, policy_learning, results
-from represent_jax.methods.config import OneGroupConfig, Problem
+from represent_jax.methods.config import OneGroupConfig, Problem, check_start
 from represent_jax.methods.plan import Stage
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import bc, policies, preference
@@ -59,6 +59,7 @@ class DrexConfig(OneGroupConfig):
             "'cold' with base 'bc'",
             self.policies.start,
         )
+        check_start(self.airl, self.policies)
 
     @property
     def needs_actions(self) -> str:

@@ -155,8 +155,8 @@ def best_start(
     reward_fn: RewardFn,
 ) -> PolicyParams:
     """The policy with the highest learned return."""
-    returns = learned_returns(key, env, [objective], starts, config, reward_fn)
-    return starts[int(np.argmax(returns[:, 0]))]
+    returns = learned_returns(key, env, [objective], starts, config, reward_fn)[:, 0]
+    return starts[int(np.argmax(np.where(np.isfinite(returns), returns, -np.inf)))]
 
 
 def learned_returns(

@@ -3,7 +3,6 @@
 import collections
 import contextlib
 import math
-import os
 import threading
 from collections.abc import Callable, Iterator
 
@@ -13,6 +12,7 @@ import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
 
+from represent_jax.host import num_cpus
 from represent_jax.physics.engine import Engine, PhysicsState
 
 _STATE_FIELDS = ("qpos", "qvel", "act", "qacc_warmstart")
@@ -39,7 +39,7 @@ class MujocoEngine(Engine):
         num_threads: int | None = None,
     ):
         super().__init__(model, frame_skip, derived_fields)
-        self.num_threads = num_threads or len(os.sched_getaffinity(0))
+        self.num_threads = num_threads or num_cpus()
         self._idle: dict[int, list[_Lane]] = collections.defaultdict(list)
         self._lock = threading.Lock()
         template = mujoco.MjData(model)

@@ -15,6 +15,7 @@ import jax
 
 from represent_jax.data.atomic import disk_errors
 from represent_jax.errors import RepresentError, UsageError, unknown
+from represent_jax.host import num_cpus
 from represent_jax.runs.directory import plain
 
 FIELDS = (
@@ -132,7 +133,7 @@ def _git(folder: Path, *arguments: str) -> str:
 
 
 def _device() -> str:
-    cpu = f"{_cpu_model()} ({_num_cpus()} cores)"
+    cpu = f"{_cpu_model()} ({num_cpus()} cores)"
     device = jax.devices()[0]
     return cpu if device.platform == "cpu" else f"{device.device_kind}, {cpu}"
 
@@ -144,12 +145,6 @@ def _cpu_model() -> str:
         lines = []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return models[0] if models else platform.processor() or platform.machine()
-
-
-def _num_cpus() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _versions() -> dict[str, str]:

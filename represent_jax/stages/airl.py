@@ -63,10 +63,11 @@ class AirlConfig:
     ppo: PpoConfig = PpoConfig()
 
     def __post_init__(self) -> None:
-        require(self.env_steps >= 1, "env_steps", "at least 1", self.env_steps)
         find_agent(self.agent)
         for field in ("cloning_updates", "cloning_noise"):
             require(getattr(self, field) >= 0, field, ">= 0", getattr(self, field))
+        for field in ("env_steps", "reward_scale", "reward_clip"):
+            require(getattr(self, field) > 0, field, "positive", getattr(self, field))
         rate = self.policy_average_rate
         require(0.0 < rate <= 1.0, "policy_average_rate", "in (0, 1]", rate)
         require(
@@ -78,7 +79,7 @@ class AirlConfig:
         # A clone is fitted before there are statistics, which would then move under its feet.
         require(
             not (self.cloning_updates and generator(self)[1].normalize_observations),
-            "normalize_observations",
+            f"{self.agent}.normalize_observations",
             "false where cloning_updates > 0",
             True,
         )
@@ -111,12 +112,22 @@ def generator(config: AirlConfig) -> tuple[ModuleType, SacConfig | PpoConfig]:
     return find_agent(config.agent), getattr(config, config.agent)
 
 
+def training_noise_levels(num_envs: int) -> jax.Array:
+    """SSRR's noise levels, for as many environments as there are, `[num_envs]`.
+
+    Repeated where there are more environments than levels; spread where there are fewer.
+    """
+    levels = jnp.asarray(TRAINING_NOISE_LEVELS)
+    if num_envs >= levels.size:
+        return jnp.resize(levels, (num_envs,))
+    return levels[jnp.linspace(0, levels.size - 1, num_envs).round().astype(int)]
+
+
 def init(key: jax.Array, env: Episode, demonstrations: Transition, config: AirlConfig) -> AirlState:
     """Starts training on one strategy's transitions, `[num_transitions]`."""
     key_agent, key_reset, key_discriminator, key_policy, key_clone = jax.random.split(key, 5)
     module, settings = generator(config)
-    levels = jnp.asarray(TRAINING_NOISE_LEVELS if config.noisy else (0.0,))
-    levels = jnp.resize(levels, (settings.num_envs,))
+    levels = training_noise_levels(settings.num_envs) * config.noisy
     start = jax.vmap(env.reset)(jax.random.split(key_reset, settings.num_envs), levels)
     policy = cloning.start(
         key_policy,

@@ -179,7 +179,10 @@ def _task_range(rewards: Rewards, rows: jax.Array, config: RegressionConfig) -> 
     most = jnp.nanmax(earned) - jnp.nanmin(earned)
     rows = task_inputs_of(rows, config)
     low, high = jnp.nanmin(rows, axis=0), jnp.nanmax(rows, axis=0)
-    return TaskRange(low, high, most / jnp.max(high - low), most)
+    width = jnp.max(high - low)
+    # What no demonstration changes says nothing of where the task ends.
+    slope = jnp.where(width > 0.0, most / jnp.where(width > 0.0, width, 1.0), 0.0)
+    return TaskRange(low, high, slope, most)
 
 
 def inputs_of(
@@ -214,20 +217,23 @@ def view_reward(
 ) -> jax.Array:
     """R^0 or R^i, `[...]`."""
     inputs = inputs_of(obs_t, action_t, next_obs_t, config)
-    reached = task_inputs_of(inputs, config)
-    if view.bounds is not None:
-        inputs = jnp.clip(inputs, *view.bounds)
-    task_inputs = task_inputs_of(inputs, config)
+    seen = inputs if view.bounds is None else jnp.clip(inputs, *view.bounds)
+    task = _task_reward(view, inputs, seen, config)
+    own_inputs = seen if view.own_bounds is None else jnp.clip(seen, *view.own_bounds)
+    return task + view.strategy_weight * head_reward(view.own, own_inputs, config)
+
+
+def _task_reward(
+    view: View, inputs: jax.Array, seen: jax.Array, config: RegressionConfig
+) -> jax.Array:
+    """R^0 of inputs of which this much is seen; it falls with their distance from its range."""
+    inputs, seen = task_inputs_of(inputs, config), task_inputs_of(seen, config)
     if view.task_range is None:
-        task = head_reward(view.task, task_inputs, config)
-    else:
-        low, high, slope, most = view.task_range
-        task = head_reward(view.task, jnp.clip(task_inputs, low, high), config)
-        distance = jnp.linalg.norm(reached - jnp.clip(reached, low, high), axis=-1)
-        task -= jnp.minimum(slope * distance, most)
-    if view.own_bounds is not None:
-        inputs = jnp.clip(inputs, *view.own_bounds)
-    return task + view.strategy_weight * head_reward(view.own, inputs, config)
+        return head_reward(view.task, seen, config)
+    low, high, slope, most = view.task_range
+    distance = jnp.linalg.norm(inputs - jnp.clip(inputs, low, high), axis=-1)
+    at_edge = head_reward(view.task, jnp.clip(seen, low, high), config)
+    return at_edge - jnp.minimum(slope * distance, most)
 
 
 def reward(

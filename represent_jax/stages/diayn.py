@@ -19,7 +19,7 @@ from flax import linen, struct
 
 from represent_jax.agents import sac
 from represent_jax.agents.sac import SacConfig
-from represent_jax.config import require
+from represent_jax.config import later, require, require_sizes
 from represent_jax.envs.episode import Episode
 from represent_jax.envs.skill import SkillConditioned
 from represent_jax.types import Metrics, Params
@@ -34,7 +34,9 @@ class DiaynConfig:
       diversity_weight: beta, the weight of the diversity reward beside the environment's.
       discriminator_obs: indices of the observation that q sees, all if empty. A prior on what
         makes a style (DIAYN, section 3.2): gaits then differ, rather than which side is up.
-      diversity_floor: lower bound of log q - log p, which is unbounded below.
+      diversity_floor, diversity_ceiling: bounds of log q - log p, which is unbounded below and at
+        most log(num_skills). With three skills or more the ceiling ends what is paid before the
+        discriminator is certain, so that the environment's reward is not outbid.
       discriminator_hidden_sizes: units of the discriminator's hidden layers.
       discriminator_learning_rate: its Adam step size.
       sac: the agent.
@@ -44,6 +46,7 @@ class DiaynConfig:
     diversity_weight: float = 1.0
     discriminator_obs: tuple[int, ...] = ()
     diversity_floor: float = -5.0
+    diversity_ceiling: float = later(1.0)
     discriminator_hidden_sizes: tuple[int, ...] = (128, 128)
     discriminator_learning_rate: float = 3e-4
     sac: SacConfig = SacConfig()
@@ -56,6 +59,19 @@ class DiaynConfig:
             f"at least num_skills ({self.num_skills})",
             self.sac.num_envs,
         )
+        require(
+            self.diversity_floor < self.diversity_ceiling,
+            "diversity_floor",
+            f"below diversity_ceiling ({self.diversity_ceiling})",
+            self.diversity_floor,
+        )
+        require(
+            self.discriminator_learning_rate > 0.0,
+            "discriminator_learning_rate",
+            "positive",
+            self.discriminator_learning_rate,
+        )
+        require_sizes(self.discriminator_hidden_sizes, "discriminator_hidden_sizes")
 
 
 @struct.dataclass
@@ -83,14 +99,25 @@ def _discriminator(obs_dim: int, config: DiaynConfig):
 
 
 def init(key: jax.Array, env: Episode, config: DiaynConfig) -> DiaynState:
-    """Starts training; each of the agent's environments belongs to one skill."""
+    """Starts training; each of the agent's environments belongs to one skill.
+
+    Raises:
+      UsageError: the discriminator is to see entries that an observation does not have.
+    """
+    size = env.observation_size
+    require(
+        all(0 <= entry < size for entry in config.discriminator_obs),
+        "discriminator_obs",
+        f"indices of an observation of size {size}",
+        config.discriminator_obs,
+    )
     key_sac, key_reset, key_discriminator = jax.random.split(key, 3)
     conditioned = SkillConditioned(env, config.num_skills)
     skills = jnp.arange(config.sac.num_envs) % config.num_skills
     start = jax.vmap(conditioned.reset)(jax.random.split(key_reset, skills.size), skills)
     agent = sac.init(key_sac, conditioned, config.sac, start)
-    module, optimizer = _discriminator(env.observation_size, config)
-    params = module.init(key_discriminator, _seen(jnp.zeros(env.observation_size), config))
+    module, optimizer = _discriminator(size, config)
+    params = module.init(key_discriminator, _seen(jnp.zeros(size), config))
     return DiaynState(agent, params, optimizer.init(params))
 
 
@@ -106,16 +133,18 @@ def _seen(obs_t: jax.Array, config: DiaynConfig) -> jax.Array:
     return obs_t[..., jnp.asarray(config.discriminator_obs)]
 
 
-def diversity_reward(log_posterior: jax.Array, skill: jax.Array, floor: float) -> jax.Array:
-    """Eq. 6 with a uniform prior: log q(z|s) + log num_skills, clipped to `[floor, 1]`.
+def diversity_reward(
+    log_posterior: jax.Array, skill: jax.Array, floor: float, ceiling: float
+) -> jax.Array:
+    """Eq. 6 with a uniform prior: log q(z|s) + log num_skills, clipped to `[floor, ceiling]`.
 
     Args:
       log_posterior: `[..., num_skills]`.
       skill: one-hot, `[..., num_skills]`.
-      floor: lower bound.
+      floor, ceiling: bounds.
     """
     log_ratio = jnp.sum(log_posterior * skill, axis=-1) + jnp.log(skill.shape[-1])
-    return jnp.clip(log_ratio, floor, 1.0)
+    return jnp.clip(log_ratio, floor, ceiling)
 
 
 def step(state: DiaynState, env: Episode, config: DiaynConfig) -> tuple[DiaynState, Metrics]:
@@ -135,7 +164,9 @@ def step(state: DiaynState, env: Episode, config: DiaynConfig) -> tuple[DiaynSta
     updates, discriminator_opt = optimizer.update(grads, state.discriminator_opt)
     discriminator = optax.apply_updates(state.discriminator, updates)
 
-    diversity = diversity_reward(log_posterior, skill, config.diversity_floor)
+    diversity = diversity_reward(
+        log_posterior, skill, config.diversity_floor, config.diversity_ceiling
+    )
     reward_t = batches.reward_t + config.diversity_weight * diversity
     agent, metrics = sac.learn(agent, batches._replace(reward_t=reward_t), config.sac)
     hit = jnp.argmax(log_posterior, axis=-1) == jnp.argmax(skill, axis=-1)

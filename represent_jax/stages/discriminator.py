@@ -6,7 +6,8 @@ AIRL (https://arxiv.org/abs/1710.11248) tells demonstrations from the policy's o
 
 where g becomes the reward and h absorbs shaping. SSRR (Chen et al., 2020) trains it on rollouts
 under action noise of known level eta, whose rows are weighted by how much less likely the clean
-policy is to act so: w = pi(a|s) / (eta u + (1 - eta) pi(a|s)), with u the uniform density.
+policy is to act so: w = pi(a|s) / (eta u + (1 - eta) pi(a|s)), with u the uniform density. Here log
+pi is bounded, in w as in the logits, so that w stays near 1 whatever the action.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ import optax
 from brax.training import networks as brax_networks
 from flax import linen, struct
 
-from represent_jax.config import require
+from represent_jax.config import require, require_sizes
 from represent_jax.types import Metrics, Params, Transition
 
 # Bound on the inputs of g and h, in deviations of the demonstrations.
@@ -57,7 +58,9 @@ class DiscriminatorConfig:
         for field in ("batch_size", "updates_per_step"):
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
         require(self.learning_rate > 0.0, "learning_rate", "positive", self.learning_rate)
-        require(self.gradient_penalty >= 0, "gradient_penalty", ">= 0", self.gradient_penalty)
+        for field in ("gradient_penalty", "weight_decay"):
+            require(getattr(self, field) >= 0.0, field, ">= 0", getattr(self, field))
+        require_sizes(self.hidden_sizes)
         require(self.log_prob_clip > 0.0, "log_prob_clip", "positive", self.log_prob_clip)
 
 

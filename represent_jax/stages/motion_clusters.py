@@ -89,7 +89,8 @@ def cluster(
       max_clusters: the most to be looked for.
 
     Raises:
-      RepresentError: a trajectory is shorter than two steps.
+      RepresentError: a trajectory is shorter than two steps, or trajectories are too much alike for
+        as many clusters.
     """
     key_features, key_halves, key_wholes = jax.random.split(key, 3)
     features = _features(key_features, _changes(trajectories), config)
@@ -97,6 +98,11 @@ def cluster(
     strengths = _strengths(_rng(key_halves), features, most, config)
     number = num_clusters or 1 + int(np.flatnonzero(strengths >= config.min_strength)[-1])
     labels = _cut(_tree(np.stack([rows.mean(axis=0) for rows in features])), number)
+    found = len(np.unique(labels))
+    if found < number:
+        raise RepresentError(
+            f"num_clusters: expected at most {found}, as many as are told apart, found {number}"
+        )
     probabilities = _probabilities(_rng(key_wholes), features, labels, number, config)
     return MotionClusters(labels, probabilities, strengths)
 

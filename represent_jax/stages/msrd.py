@@ -98,7 +98,7 @@ class MsrdConfig:
         # A clone is fitted before there are statistics, which would then move under its feet.
         require(
             not (self.cloning_updates and self.sac.normalize_observations),
-            "normalize_observations",
+            "sac.normalize_observations",
             "false where cloning_updates > 0",
             True,
         )

@@ -29,7 +29,8 @@ class PoliciesConfig:
     """Settings of policy training on learned rewards.
 
     Attributes:
-      env_steps: budget of each target.
+      env_steps: budget of each target, rounded up to whole evaluations. Those that SAC takes at
+        random before its first update, `sac.warmup_env_steps`, are not counted.
       agent: "sac" or "ppo".
       start: "phase1" starts from Phase 1's policy, "cold" from random networks.
       keep: which policy is handed on: of those evaluated the "best" by learned return, Phase 1's
@@ -160,7 +161,8 @@ def init(
     to_beat = jnp.float32(-jnp.inf)
     if config.start == "phase1":
         key_eval = jax.random.fold_in(key, 0)
-        to_beat = evaluate(key_eval, env, objective, best, config, reward_fn).learned_return
+        learned = evaluate(key_eval, env, objective, best, config, reward_fn).learned_return
+        to_beat = jnp.where(jnp.isfinite(learned), learned, -jnp.inf)
     return PolicyState(state, best, to_beat)
 
 
@@ -189,7 +191,7 @@ def train(
     state = PolicyState(
         agent=agent_state.replace(key=key),
         best=jax.tree.map(lambda new, old: jnp.where(better, new, old), policy, state.best),
-        best_learned_return=jnp.maximum(result.learned_return, state.best_learned_return),
+        best_learned_return=jnp.where(better, result.learned_return, state.best_learned_return),
     )
     return state, {**metrics, **result._asdict()}
 

@@ -17,7 +17,7 @@ import numpy as np
 import optax
 from flax import struct
 
-from represent_jax.config import require
+from represent_jax.config import require, require_sizes
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.errors import RepresentError
 from represent_jax.stages.mlp import Mlp, squared_kernels
@@ -59,12 +59,7 @@ class PreferenceConfig:
         for field in ("learning_rate", "kernel_scale"):
             require(getattr(self, field) > 0.0, field, "> 0", getattr(self, field))
         require(0.0 < self.min_level_gap <= 1.0, "min_level_gap", "in (0, 1]", self.min_level_gap)
-        require(
-            all(size >= 1 for size in self.hidden_sizes),
-            "hidden_sizes",
-            "each at least 1",
-            self.hidden_sizes,
-        )
+        require_sizes(self.hidden_sizes)
         require(self.l2 >= 0.0, "l2", ">= 0", self.l2)
 
 
@@ -154,14 +149,10 @@ def sample_pairs(
     horizon = trajectories.mask.shape[1]
     admissible = _clearly_less_noisy(trajectories.noise_level, config.min_level_gap)
     # One draw numbers a pair among all admissible ones, row by row: exact, in integers.
-    within_row = jnp.cumsum(admissible.astype(jnp.int32), axis=1)
-    in_row = within_row[:, -1]
-    cumulative = jnp.cumsum(in_row)
+    cumulative = jnp.cumsum(admissible.astype(jnp.int32).ravel())
     draw = jax.random.randint(key_pair, (num_pairs,), 0, cumulative[-1])
-    better = jnp.sum(cumulative <= draw[:, None], axis=1)
-    rank = draw - (cumulative - in_row)[better]
-    worse = jnp.sum(within_row[better] <= rank[:, None], axis=1)
-    index = jnp.stack([better, worse], axis=1)
+    pair = jnp.searchsorted(cumulative, draw, side="right")
+    index = jnp.stack(jnp.divmod(pair, admissible.shape[1]), axis=1)
     alive = jnp.sum(trajectories.mask, axis=1).astype(jnp.int32)[index]
     length = jnp.minimum(config.snippet_steps, alive)
     start = jax.random.randint(key_start, index.shape, 0, alive - length + 1)

@@ -3,7 +3,7 @@
 import dataclasses
 import enum
 
-from represent_jax.config import later, require
+from represent_jax.config import later, require, require_sizes
 
 
 class Discrimination(enum.StrEnum):
@@ -80,8 +80,19 @@ class RegressionConfig:
     learn_units: bool = later(True, before=False)
 
     def __post_init__(self) -> None:
-        for field in ("num_updates", "num_snippets", "ensemble_size", "min_snippet_steps"):
+        for field in (
+            *("num_updates", "num_snippets", "num_demonstration_states"),
+            *("min_snippet_steps", "ensemble_size"),
+        ):
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
+        for field in ("learning_rate", "kernel_scale", "return_scale"):
+            require(getattr(self, field) > 0.0, field, "positive", getattr(self, field))
+        for field in (
+            *("l2", "strategy_l2", "strategy_weight"),
+            *("lambda_ssrr", "lambda_reg", "lambda_bcd"),
+        ):
+            require(getattr(self, field) >= 0.0, field, ">= 0", getattr(self, field))
+        require_sizes(self.hidden_sizes)
         require(
             self.states_per_snippet >= 2 and self.states_per_snippet % 2 == 0,
             "states_per_snippet",

@@ -45,5 +45,6 @@ def choose(learned_returns: jax.Array, margins: jax.Array) -> jax.Array:
     """
     own = jnp.diagonal(learned_returns)
     known = jnp.where(jnp.isfinite(learned_returns), learned_returns, -jnp.inf)
-    better = jnp.max(known, axis=0) > own + margins * jnp.abs(own)
+    to_beat = jnp.where(jnp.isfinite(own), own + margins * jnp.abs(own), -jnp.inf)
+    better = jnp.max(known, axis=0) > to_beat
     return jnp.where(better, jnp.argmax(known, axis=0), jnp.arange(own.shape[0]))

@@ -11,6 +11,7 @@ from brax.training import networks as brax_networks
 from flax import linen, struct
 
 from represent_jax.data.trajectories import Trajectory
+from represent_jax.errors import RepresentError
 from represent_jax.types import Params
 
 _MODULE_SIZES = (64, 64)
@@ -87,8 +88,18 @@ def pairwise_accuracy(trajectories: Sequence[Trajectory]) -> dict[str, dict[str,
     Returns:
       For every pair, such as "1-2": accuracy on single "states" and on whole "trajectories",
       which are judged by their states' mean log posterior.
+
+    Raises:
+      RepresentError: a strategy has fewer than two trajectories.
     """
     num_strategies = 1 + max(t.strategy for t in trajectories)
+    for strategy in range(num_strategies):
+        found = len(_own(trajectories, strategy))
+        if found < 2:
+            raise RepresentError(
+                f"strategy {strategy + 1}: expected at least 2 trajectories, one to fit and one to "
+                f"judge, found {found}"
+            )
     fit_pair = jax.jit(fit, static_argnums=3)
     result = {}
     for pair in itertools.combinations(range(num_strategies), 2):

@@ -56,6 +56,7 @@ def shown():
         ("represent", (), ""),
         ("represent", ("regression.include_action=true",), "regression.include_action=true"),
         ("ssrr", ("airl.discriminator.state_only=false",), "airl.discriminator.state_only=false"),
+        ("represent", ("airl.learn_policy=false",), "airl.learn_policy=false"),
     ],
 )
 def test_methods_that_need_actions_refuse_states_alone(env, shown, method, override, needs):

@@ -119,6 +119,19 @@ def test_noise_levels_are_those_of_ssrr(problem):
     np.testing.assert_allclose(levels, airl.TRAINING_NOISE_LEVELS)
 
 
+@pytest.mark.parametrize(
+    "num_envs, expected",
+    [
+        (1, [0.0]),
+        (2, [0.0, 0.25]),
+        (4, [0.0, 0.0, 0.1, 0.25]),
+        (12, [*airl.TRAINING_NOISE_LEVELS, 0.0, 0.0]),
+    ],
+)
+def test_any_number_of_environments_has_clean_and_noisy_ones(num_envs, expected):
+    np.testing.assert_allclose(airl.training_noise_levels(num_envs), expected)
+
+
 def test_bad_settings_are_named():
     with pytest.raises(UsageError, match="env_steps"):
         airl.AirlConfig(env_steps=0)
@@ -129,8 +142,13 @@ def test_bad_settings_are_named():
     with pytest.raises(UsageError, match="cloning_updates"):
         airl.AirlConfig(cloning_updates=0, learn_policy=False)
     normalizing = dataclasses.replace(SMOKE.airl.sac, normalize_observations=True)
-    with pytest.raises(UsageError, match="normalize_observations"):
+    with pytest.raises(UsageError, match=r"^sac\.normalize_observations"):
         airl.AirlConfig(sac=normalizing)
     wide = dataclasses.replace(SMOKE.airl.sac, hidden_sizes=(16, 16))
     with pytest.raises(UsageError, match=r"policies\.sac\.hidden_sizes"):
         dataclasses.replace(SMOKE, airl=dataclasses.replace(SMOKE.airl, sac=wide))
+    sac = dataclasses.replace(SMOKE.policies.sac, normalize_observations=True)
+    with pytest.raises(UsageError, match=r"^policies\.sac\.normalize_observations"):
+        dataclasses.replace(SMOKE, policies=dataclasses.replace(SMOKE.policies, sac=sac))
+    with pytest.raises(UsageError, match=r"^reward_clip: expected positive, found -10"):
+        airl.AirlConfig(reward_clip=-10.0)

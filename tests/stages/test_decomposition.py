@@ -113,6 +113,17 @@ def test_the_task_reward_falls_beyond_what_was_demonstrated(quantile):
     )
 
 
+def test_the_task_reward_is_finite_where_demonstrations_change_nothing_that_it_sees():
+    config = dataclasses.replace(CONFIG, task_entries=(1,), within_demonstrations=True)
+    obs = np.random.default_rng(0).normal(size=(2, 21, 2))
+    still = obs * [1.0, 0.0]
+    noisy, alone = (jax.tree.map(lambda x: x[None], batches.make(one)) for one in (obs, still))
+    rewards = decomposition.bound(draw(2, 1, config), noisy, alone, config)
+    reward = decomposition.reward(rewards, None, None, noisy.obs[0, :, 1:], config)
+    np.testing.assert_array_equal(reward, np.full(reward.shape, reward[0, 0]))
+    assert np.isfinite(reward).all()
+
+
 def test_a_strategy_is_paid_for_nothing_that_it_did_not_show():
     config = dataclasses.replace(CONFIG, within_demonstrations=True)
     random = np.random.default_rng(0)

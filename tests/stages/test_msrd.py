@@ -314,6 +314,6 @@ def test_bad_settings_are_named(field, value):
 
 def test_clones_do_not_normalise_observations():
     normalizing = dataclasses.replace(CONFIG.sac, normalize_observations=True)
-    with pytest.raises(UsageError, match="normalize_observations"):
+    with pytest.raises(UsageError, match=r"^sac\.normalize_observations"):
         msrd.MsrdConfig(sac=normalizing)
     assert msrd.MsrdConfig(sac=normalizing, cloning_updates=0).sac is normalizing

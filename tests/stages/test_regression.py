@@ -155,5 +155,11 @@ def test_bad_settings_are_named():
         RegressionConfig(discrimination="unknown")
     with pytest.raises(UsageError, match="states_per_snippet"):
         RegressionConfig(states_per_snippet=3)
+    with pytest.raises(UsageError, match="num_demonstration_states: expected at least 1"):
+        RegressionConfig(num_demonstration_states=0)
+    with pytest.raises(UsageError, match="strategy_weight: expected >= 0, found nan"):
+        RegressionConfig(strategy_weight=float("nan"))
+    with pytest.raises(UsageError, match="hidden_sizes: expected each at least 1"):
+        RegressionConfig(hidden_sizes=(128, 0))
     with pytest.raises(UsageError, match="max_snippet_steps"):
         RegressionConfig(min_snippet_steps=50, max_snippet_steps=40)

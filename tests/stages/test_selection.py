@@ -40,6 +40,10 @@ def test_one_target_has_one_choice():
     assert jax.jit(choose)(jnp.array([[jnp.nan]]), jnp.zeros(1)).tolist() == [0]
 
 
+def test_a_policy_of_no_finite_return_is_replaced():
+    assert chosen([jnp.nan, jnp.nan, 0.0], [5.0, 6.0, 0.0], [1.0, jnp.nan, jnp.nan]) == [1, 1, 0]
+
+
 def test_what_is_not_finite_is_never_handed_to_others():
     assert chosen([jnp.nan, jnp.nan, 1.0], [1.0, 1.0, 1.0], [2.0, 0.5, 1.0])[1] == 1
 

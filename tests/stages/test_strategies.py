@@ -217,6 +217,9 @@ def test_what_cannot_be_told_is_an_error():
         strategies.infer(KEY, [_swing(3.0, 0), short], OF_MOTION)
     with pytest.raises(RepresentError, match="at most 1"):
         strategies.infer(KEY, _pool(1, each=1), dataclasses.replace(CONFIG, num_strategies=2))
+    with pytest.raises(RepresentError, match="at most 1, as many as are told apart, found 3"):
+        alike = dataclasses.replace(OF_MOTION, num_strategies=3)
+        strategies.infer(KEY, [_swing(3.0, 0)] * 4, alike)
     with pytest.raises(UsageError, match="prior_steps"):
         StrategiesConfig(prior_steps=(1.0, 0.0))
     with pytest.raises(UsageError, match="bandwidth"):
