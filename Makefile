@@ -52,7 +52,7 @@ format: $(VENV)/.installed-dev ## sort imports, apply safe fixes, format
 	@$(RUN) ruff check --fix .
 	@$(RUN) ruff format .
 
-bench: $(VENV)/.installed ## speed of the engines and of each stage on this machine
+bench: $(VENV)/.installed ## speed of the engines and of updates on this machine
 	@$(RUN) experiments.benchmark
 
 lock: ## write constraints.txt anew with uv, keeping pins; LOCK=--upgrade moves them

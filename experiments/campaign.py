@@ -51,10 +51,14 @@ def main(argv: list[str]) -> None:
         raise unknown("engine", _ENGINE.value, _ENGINES)
     if _WANDB.value and _ENGINE.value != "local":
         raise UsageError("--wandb: expected --engine=local, Ray's workers log to their files alone")
+    if _ENGINE.value == "local":
+        launch.refuse_beside(
+            "with --engine=local",
+            ("address", "shared_folder", "retries", "stage_cpus", "stage_gpus"),
+        )
+    overrides = launch.overrides(_OVERRIDE.value)
     seeds = range(_SEED.value, _SEED.value + _SEEDS.value)
-    every = entries(
-        _TABLES.value, _DOMAINS.value, seeds, _PRESET.value, _OVERRIDE.value, _VARIANTS.value
-    )
+    every = entries(_TABLES.value, _DOMAINS.value, seeds, _PRESET.value, overrides, _VARIANTS.value)
     wanted = (node for entry in every for node in entry.reports.values())
     graph = Graph(wanted, _OUT.value, _track if _WANDB.value else None)
     records = _RECORD.value or f"{_OUT.value}/records.jsonl"

@@ -12,12 +12,12 @@ Elsewhere each process is told where the first one listens, how many there are a
 
 import sys
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from absl import app, flags, logging
 
-from represent_jax.errors import RepresentError
+from represent_jax.errors import RepresentError, UsageError
 
 _TRACEBACK = flags.DEFINE_bool("traceback", False, "Show where an error came from.")
 _DISTRIBUTED = flags.DEFINE_bool("distributed", False, "Be one of several processes of a run.")
@@ -34,7 +34,9 @@ def run(main: Callable[[list[str]], None]) -> None:
 
 def _guarded(main: Callable[[list[str]], None], argv: list[str]) -> None:
     try:
-        if _DISTRIBUTED.value:
+        if not _DISTRIBUTED.value:
+            refuse_beside("without --distributed", ("coordinator", "num_processes", "process"))
+        else:
             from represent_jax.runs import processes
 
             processes.join(_COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS.value)
@@ -44,6 +46,27 @@ def _guarded(main: Callable[[list[str]], None], argv: list[str]) -> None:
             raise
         print(f"error: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
+
+
+def overrides(values: Sequence[str]) -> list[str]:
+    """Refuses to override what a flag says, since other things follow from the flag."""
+    for one in values:
+        name = one.partition("=")[0]
+        if name in ("method", "env", "preset", "seed"):
+            raise UsageError(f"--override {one}: expected a flag for {name}, it has one of its own")
+    return list(values)
+
+
+def refuse_beside(cause: str, names: Sequence[str]) -> None:
+    """Refuses flags that were given and would do nothing.
+
+    Args:
+        cause: why they would do nothing.
+        names: of the flags.
+    """
+    given = [f"--{name}" for name in names if flags.FLAGS[name].present]
+    if given:
+        raise UsageError(f"{', '.join(given)}: without effect {cause}")
 
 
 def open_page(page: Path) -> None:

@@ -67,7 +67,7 @@ def main(argv: list[str]) -> None:
             demonstrations=_DEMONSTRATIONS.value,
             test=_TEST.value,
         )
-        config = configs.apply_overrides(config, _OVERRIDE.value)
+        config = configs.apply_overrides(config, launch.overrides(_OVERRIDE.value))
         out = _OUT.value or f"runs/{config.env}-{config.method}-{config.preset}-{seed}"
         if _OUT.value and _NUM_SEEDS.value > 1:
             out = f"{_OUT.value}/seed_{seed}"
@@ -88,6 +88,8 @@ def _run(config: MethodConfig, out: str) -> None:
     method = find_method(config.method)
     stages = method.plan(config, problem, _CHECKPOINT_SECONDS.value)
     names = stage_names(stages, _UNTIL.value)
+    if len(names) < len(stages):
+        launch.refuse_beside(f"with --until={_UNTIL.value}", ("record", "videos", "open"))
     if _DRY_RUN.value:
         print(f"{out}: {' -> '.join(names)}")
         return

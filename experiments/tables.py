@@ -30,6 +30,7 @@ def main(argv: list[str]) -> None:
     if not records:
         raise UsageError(f"{_RECORDS.value}: no records there")
     if _UPDATE.value:
+        launch.refuse_beside("with --update", ("table", "preset", "format"))
         _update(Path(_UPDATE.value), records)
         return
     shown = [tables.make(name, records, _PRESET.value) for name in _TABLE.value]

@@ -13,7 +13,7 @@ from absl import flags
 from experiments import launch
 from represent_jax import config as configs
 from represent_jax.agents import ppo, rollout, sac
-from represent_jax.api import load_config, load_reward
+from represent_jax.api import load_config, load_reward_for
 from represent_jax.envs import Episode, make_env
 from represent_jax.errors import UsageError, unknown
 from represent_jax.runs import open_run
@@ -43,18 +43,23 @@ def main(argv: list[str]) -> None:
         raise unknown("agent", _AGENT.value, _AGENTS)
     if not (_RUN.value or _ENV.value):
         raise UsageError("give --run, for its learned reward, or --env, for the true one")
+    if not _RUN.value:
+        launch.refuse_beside("without --run", ("target",))
     agent, config = _AGENTS[_AGENT.value]
     config = configs.apply_overrides(config, _OVERRIDE.value)
-    env = Episode(make_env(_ENV.value or load_config(_RUN.value).env, _BACKEND.value))
+    made = load_config(_RUN.value) if _RUN.value else None
+    env = make_env(_ENV.value or made.env, _BACKEND.value)
+    env = Episode(env, made.horizon if made and made.horizon else env.horizon)
     whole = Episode(env.env, env.horizon, auto_reset=False)
-    learned = load_reward(_RUN.value) if _RUN.value else None
     reward_fn = None
-    if learned is not None:
-        # In the unit in which a noise-free demonstrator earns about 1 a step.
-        scale = env.horizon / load_config(_RUN.value).regression.return_scale
+    if made is not None:
+        sizes = (env.observation_size, env.action_size)
+        learned = load_reward_for(_RUN.value, _TARGET.value, *sizes)
+        # In the unit in which a noise-free demonstrator earns about 1 a step, where curves set one.
+        scale = env.horizon / made.regression.return_scale if hasattr(made, "regression") else 1.0
 
         def reward_fn(_, obs_t, action_t, next_obs_t):
-            return scale * learned(obs_t, action_t, next_obs_t, target=_TARGET.value)
+            return scale * learned(obs_t, action_t, next_obs_t)
 
     num_steps = max(1, _EVAL_ENV_STEPS.value // config.env_steps_per_step)
 
@@ -72,6 +77,9 @@ def main(argv: list[str]) -> None:
         return state, result
 
     with open_run(_OUT.value, _settings(config), resume=_RESUME.value) as run:
+        if run.is_done("policy"):
+            print(f"{_OUT.value}: done already")
+            return
         start = time.monotonic()
         init = jax.jit(lambda key: agent.init(key, env, config))
         env_steps = num_steps * config.env_steps_per_step

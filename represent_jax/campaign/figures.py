@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from represent_jax.campaign.tables import METHOD_NAMES
+from represent_jax.campaign.tables import VARIANT_NAMES
 from represent_jax.report import figures
 from represent_jax.report.values import display_name
 
@@ -34,7 +34,7 @@ def _draw(ax: Axes, target: str, methods: Mapping[str, Sequence[Path]]) -> None:
         steps = seeds[0][0]
         returns = np.stack([values for _, values in seeds])
         mean, std = returns.mean(axis=0), returns.std(axis=0)
-        label = f"{METHOD_NAMES[method]} ({len(seeds)} seed{'s' * (len(seeds) > 1)})"
+        label = f"{VARIANT_NAMES[method]} ({len(seeds)} seed{'s' * (len(seeds) > 1)})"
         ax.plot(steps, mean, color=colour, lw=1.6, label=label)
         ax.fill_between(steps, mean - std, mean + std, color=colour, alpha=0.18, lw=0)
     ax.set_title(display_name(target))

@@ -9,7 +9,7 @@ from represent_jax.campaign.statistics import Aggregate, aggregate
 from represent_jax.campaign.variants import ABLATIONS, GYM_DOMAINS, KITCHENS, NUMS_STRATEGIES
 from represent_jax.errors import RepresentError, unknown
 from represent_jax.report.tables import Table
-from represent_jax.report.values import display_name, format_number
+from represent_jax.report.values import METHOD_NAMES, display_name, format_number
 
 DOMAIN_NAMES = {
     "hopper": "Hopper",
@@ -18,14 +18,10 @@ DOMAIN_NAMES = {
     "franka_kitchen": "Franka Kitchen",
     "franka_kitchen_hand": "Franka Kitchen, by hand",
 }
-METHOD_NAMES = {
-    "represent": "REPRESENT",
-    "ssrr": "SSRR",
-    "msrd": "MSRD",
-    "drex": "D-REX",
-    "bc": "BC",
-    "bc_rnn": "BC-RNN",
+VARIANT_NAMES = {
+    **METHOD_NAMES,
     "noisy_airl": "Noisy-AIRL",
+    "phase_1": "Phase 1",
     "airl": "AIRL",
     "demonstrators": "Demonstrators",
     "no_reg": "without L_reg",
@@ -132,7 +128,7 @@ def ablations(select: Select) -> list[Cell]:
     return [
         select.cell("hopper", target, method, quantity, published)
         for target in _TARGETS
-        for method in ("represent", *ABLATIONS)
+        for method in ("represent", *ABLATIONS, "ssrr")
         for quantity in _RETURNS
         for published in [
             paper.ABLATIONS.get((target, method)) if quantity == "return_best" else None
@@ -151,7 +147,9 @@ def kitchen(select: Select) -> list[Cell]:
             for quantity in ("return_final", *_OUTCOMES, "pearson_test"):
                 cells.append(select.cell(domain, target, method, quantity))
         if target != "task":
-            cells += _imitation(select, domain, target, "return_final")
+            # By the joints it is a clone that does not learn.
+            first = select.cell(domain, target, "represent", "airl_return")
+            cells.append(first._replace(method="phase_1", quantity="return_final"))
     return cells
 
 
@@ -242,7 +240,7 @@ def to_table(title: str, cells: Sequence[Cell]) -> Table:
         rows.append(
             (
                 _row_name(cell),
-                METHOD_NAMES[cell.method],
+                VARIANT_NAMES[cell.method],
                 _QUANTITY_NAMES[cell.quantity],
                 _plus_minus(found.mean, found.std, digits),
                 format_number(found.iqm, digits),
@@ -302,7 +300,7 @@ def _to_grid(
         counted += ", or as many as square brackets say"
     return Table(
         title=f"{title}: {_QUANTITY_NAMES[quantity]}",
-        columns=("", *(METHOD_NAMES[method] for method in methods)),
+        columns=("", *(VARIANT_NAMES[method] for method in methods)),
         rows=tuple(
             (name, *(row.get(method, "-") for method in methods)) for name, row in shown.items()
         ),

@@ -7,6 +7,7 @@ from represent_jax import config as configs
 from represent_jax.errors import UsageError, unknown
 from represent_jax.methods.config import MethodConfig
 from represent_jax.methods.presets import make_config
+from represent_jax.methods.registry import setting_names
 
 GYM_DOMAINS = ("hopper", "half_cheetah", "inverted_double_pendulum")
 # The paper's, driven by joint velocities, and the same driven by the hand.
@@ -32,14 +33,23 @@ class Variant:
     overrides: tuple[str, ...] = ()
 
     def config(self, preset: str, domain: str, overrides: Sequence[str] = ()) -> MethodConfig:
-        """The settings of a preset, changed as the variant says and then by `overrides`.
+        """The settings of a preset, changed by `overrides` and then as the variant says.
 
         Overrides of stages that the method does not have are left out.
+
+        Raises:
+          UsageError: no preset of that name, or a setting that no method has, or of another kind.
         """
         config = make_config(preset, domain, self.method)
         own = {field.name for field in dataclasses.fields(config)}
-        general = [one for one in overrides if one.partition("=")[0].partition(".")[0] in own]
-        return configs.apply_overrides(config, [*self.overrides, *general])
+        general = []
+        for one in overrides:
+            name = one.partition("=")[0].partition(".")[0]
+            if name in own:
+                general.append(one)
+            elif name not in setting_names():
+                raise unknown("setting", name, setting_names())
+        return configs.apply_overrides(config, [*general, *self.overrides])
 
 
 # Figure 5 shows how fast policies learn: from random networks, evaluated often.

@@ -8,7 +8,10 @@ from represent_jax.runs import RunDirectory
 
 
 class Clock:
-    """Seconds spent in each stage, kept across restarts in the run's log."""
+    """Seconds spent in each stage, kept across restarts in the run's log.
+
+    What a killed process spent in the stage that it was in is not known, and left out.
+    """
 
     def __init__(self, directory: RunDirectory):
         self._directory = directory

@@ -93,7 +93,7 @@ def plan_bc_rnn(
         return rollouts.rollout_recurrent(env, policy, params, carry, key, levels)
 
     return (
-        Stage("bc_rnn", train, (), {"bc_rnn": config.bc_rnn}),
+        Stage("bc_rnn", train, (), {"bc_rnn": config.bc_rnn}, sees_pauses=True),
         _evaluation(config, problem, "bc_rnn", episodes),
     )
 
@@ -105,7 +105,7 @@ def _evaluation(config, problem, trained_in, episodes) -> Stage:
             key, config, problem, policies, {}, (), directory
         )
 
-    return Stage("policy_evaluation", judge, (trained_in,), reports=True)
+    return Stage("policy_evaluation", judge, (trained_in,), config.names, reports=True)
 
 
 def train_bc(

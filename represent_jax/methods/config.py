@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from represent_jax.config import require
 from represent_jax.data.trajectories import Demonstrations, Trajectory, without_pauses
-from represent_jax.envs import Environment, Episode
+from represent_jax.envs import Environment, Episode, registry
 from represent_jax.errors import RepresentError, UsageError, unknown
 from represent_jax.stages import airl, decomposition, policies
 from represent_jax.stages.airl import AirlConfig
@@ -92,6 +92,11 @@ class MethodConfig:
         return self.target_names
 
     @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """What a judge calls things, which is all that tells some runs' findings apart."""
+        return {"groups": self.group_names, "targets": self.target_names}
+
+    @property
     def needs_actions(self) -> str:
         """What in these settings needs demonstrated actions; empty where states are enough."""
         return ""
@@ -143,7 +148,9 @@ class RepresentConfig(MethodConfig):
         """ "task", "strategy_1", ...; one name where nothing is decomposed (alpha = 0)."""
         if self.regression.strategy_weight == 0.0:
             return (self.merged_name,)
-        return ("task", *strategy_names(self.num_groups))
+        if self.grouping == "merged":
+            return ("task", *strategy_names(1))
+        return ("task", *self.group_names)
 
     @property
     def policy_names(self) -> tuple[str, ...]:
@@ -158,12 +165,9 @@ class RepresentConfig(MethodConfig):
 
     @property
     def needs_actions(self) -> str:
-        """Rewards that see actions, and a policy that stays a clone; others do without."""
-        if not self.airl.discriminator.state_only:
-            return "airl.discriminator.state_only=false"
-        if not self.airl.learn_policy:
-            return "airl.learn_policy=false"
-        return "regression.include_action=true" if self.regression.include_action else ""
+        """Phase 1 as it is set, and rewards that see actions; others do without."""
+        needed = "regression.include_action=true" if self.regression.include_action else ""
+        return self.airl.needs_actions or needed
 
     def check_against(self, obs_dim: int) -> None:
         decomposition.check_entries(self.regression, obs_dim)
@@ -228,6 +232,10 @@ def make_problem(
     for what, data in (("demonstrations", demonstrations), ("test trajectories", test)):
         if data is None:
             continue
+        # A name that nobody registered may be anyone's for this robot.
+        own = (config.env, env.name)
+        if data.env_name in registry.names() and data.env_name not in own:
+            raise RepresentError(f"{what} are of {data.env_name}, expected {env.name}")
         data.check_against(env.observation_size, env.action_size, -1.0, 1.0)
         if config.needs_actions and not data.has_actions:
             raise UsageError(f"{what} hold no actions, which {config.needs_actions} needs")

@@ -66,7 +66,7 @@ class DrexConfig(OneGroupConfig):
         """Its own base is a clone."""
         if self.base == "bc":
             return "base=bc (base=airl does without)"
-        return "" if self.airl.discriminator.state_only else "airl.discriminator.state_only=false"
+        return self.airl.needs_actions
 
 
 def configure(settings: dict[str, Any]) -> dict[str, Any]:
@@ -141,9 +141,17 @@ def plan(
     return (
         *first,
         Stage("preference", prefer, ("noise",), {"preference": config.preference}),
-        Stage("reward_evaluation", judge_rewards, ("noise", "preference"), reports=True),
+        Stage(
+            "reward_evaluation", judge_rewards, ("noise", "preference"), config.names, reports=True
+        ),
         Stage("policies", train, (config.base, "noise", "preference"), settings),
-        Stage("policy_evaluation", judge_policies, ("preference", "policies"), reports=True),
+        Stage(
+            "policy_evaluation",
+            judge_policies,
+            ("preference", "policies"),
+            config.names,
+            reports=True,
+        ),
     )
 
 

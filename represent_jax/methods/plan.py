@@ -35,6 +35,7 @@ class Stage:
       inputs: names of the stages whose outputs it is given, in order.
       settings: what the output depends on beside the problem, the seed and the inputs.
       reports: whether the output is a part of the run's results.
+      sees_pauses: whether it learns from whole demonstrations, `Problem.demonstrations`.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Stage:
     inputs: tuple[str, ...] = ()
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     reports: bool = False
+    sees_pauses: bool = False
 
 
 def stage_key(seed: int, name: str) -> jax.Array:
@@ -132,13 +134,20 @@ def nodes(
         "seed": config.seed,
         "demonstrations": _digest(problem.lessons.trajectories),
     }
-    judged = common | {"test": _digest(problem.test)}
+    # Judges look at what methods do not, pauses and test trajectories.
+    judged = common | {
+        "test": _digest(problem.test),
+        "whole_demonstrations": _digest(problem.demonstrations.trajectories),
+    }
     made: dict[str, Node] = {}
     for stage in stages:
         made[stage.name] = Node(
             kind=f"{config.env} {stage.name}",
             name=f"{name} {stage.name}",
-            settings={**(judged if stage.reports else common), **configs.identity(stage.settings)},
+            settings={
+                **(judged if stage.reports or stage.sees_pauses else common),
+                **configs.identity(stage.settings),
+            },
             inputs=tuple(made[before] for before in stage.inputs),
             run=functools.partial(run_stage, config.seed, stage),
         )

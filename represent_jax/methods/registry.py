@@ -1,5 +1,6 @@
 """Methods by name."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -86,3 +87,10 @@ def find_method(name: str) -> Method:
     if name not in METHODS:
         raise unknown("method", name, METHODS)
     return METHODS[name]
+
+
+def setting_names() -> frozenset[str]:
+    """Names of the settings, and groups of settings, that any method has."""
+    return frozenset(
+        field.name for method in METHODS.values() for field in dataclasses.fields(method.config)
+    )

@@ -144,10 +144,22 @@ def last_stages(
         selection = (Stage("selection", select, inputs, {"selection": config.selection}),)
         handed_on = "selection"
     return (
-        Stage("reward_evaluation", judge_rewards, ("noise", "curve", "regression"), reports=True),
+        Stage(
+            "reward_evaluation",
+            judge_rewards,
+            ("noise", "curve", "regression"),
+            config.names,
+            reports=True,
+        ),
         Stage("policies", train, ("airl", "regression"), settings),
         *selection,
-        Stage("policy_evaluation", judge_policies, ("regression", handed_on), reports=True),
+        Stage(
+            "policy_evaluation",
+            judge_policies,
+            ("regression", handed_on),
+            config.names,
+            reports=True,
+        ),
     )
 
 

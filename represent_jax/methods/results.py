@@ -94,7 +94,7 @@ def judge_airl(
     judged = [{"return": float(value)} for value in returns]
     for i, one in enumerate(judged):
         if problem.demonstrations.has_rewards:
-            one["ratio"] = one["return"] / problem.demonstrations.mean_return(i)
+            one["ratio"] = _ratio(one["return"], problem.demonstrations.mean_return(i))
         if found is not None:
             one["pearson_test"] = float(found.pearson[i])
             one["spearman_test"] = float(found.spearman[i])
@@ -254,19 +254,18 @@ def judge_policies(
         true = np.asarray(rollouts.true_returns(batch))
         group = config.group_names.index(name) if name in config.group_names else None
         final = float(np.mean(true))
-        path = {"env_steps": [line["step"] for line in log]} | {
-            quantity: [line[quantity][i] for line in log]
+        path = {"env_steps": np.asarray([line["step"] for line in log], float)} | {
+            quantity: np.asarray([line[quantity][i] for line in log], float)
             for quantity in ("true_return", "learned_return")
         }
-        for quantity, values in path.items():
-            curves[f"{name}/{quantity}"] = np.asarray(values, float)
+        curves |= {f"{name}/{quantity}": values for quantity, values in path.items()}
         shares = share_of_styles(batch)
         results[name] = {
             "return_final": final,
             "return_final_std": float(np.std(true)),
-            "return_last": path["true_return"][-1] if log else final,
-            "return_best": max([*path["true_return"], final]),
-            "env_steps_to_90_percent": _env_steps_to(0.9, log, path["true_return"]),
+            "return_last": float(path["true_return"][-1]) if log else final,
+            "return_best": float(np.fmax.reduce([*path["true_return"], final])),
+            "env_steps_to_90_percent": _env_steps_to(0.9, path["env_steps"], path["true_return"]),
             "learned_return_final": (
                 float(np.mean(learned[name](batch))) if name in learned else None
             ),
@@ -279,7 +278,7 @@ def judge_policies(
         if means is not None:
             base = float(np.mean(means)) if group is None else means[group]
             results[name]["demonstrators_return"] = base
-            results[name]["ratio_to_demonstrators"] = final / base
+            results[name]["ratio_to_demonstrators"] = _ratio(final, base)
     if log:
         directory.save_arrays("learning_curves", curves)
     return {"policies": results}
@@ -302,14 +301,17 @@ def describe_selection(config: MethodConfig, trained: Trained) -> dict[str, Any]
     }
 
 
-def _env_steps_to(
-    share: float, log: Sequence[Mapping[str, Any]], true_returns: Sequence[float]
-) -> int | None:
-    """Env steps after which a share of the last return was first reached; None without a log."""
-    for line, value in zip(log, true_returns, strict=True):
-        if value >= share * true_returns[-1]:
-            return line["step"]
-    return None
+def _ratio(value: float, base: float) -> float | None:
+    return value / base if base else None
+
+
+def _env_steps_to(share: float, env_steps: np.ndarray, true_returns: np.ndarray) -> int | None:
+    """Env steps after which a return was first within a share of the last; None without any."""
+    if not len(true_returns):
+        return None
+    last = true_returns[-1]
+    reached = true_returns >= last - (1.0 - share) * abs(last)
+    return int(env_steps[np.argmax(reached)]) if reached.any() else None
 
 
 def _style_judge(key: jax.Array, problem: Problem) -> Callable[[TrajectoryBatch], jax.Array]:

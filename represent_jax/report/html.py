@@ -14,18 +14,11 @@ from matplotlib.figure import Figure
 from represent_jax.data.atomic import replacing
 from represent_jax.report import contents, diagnostics, figures, showcase, tables
 from represent_jax.report.page import document, flat, gallery, pairs, table, text
-from represent_jax.report.values import display_name, format_number
+from represent_jax.report.values import METHOD_NAMES, display_name, format_number
 from represent_jax.runs.records import provenance
 
-_STAGES = {
-    "airl": "imitation",
-    "curve": "noise curves",
-    "rewards": "rewards",
-    "policies": "policies",
-}
-
 _CURVES_NOTE = (
-    "Each circle is the mean return of rollouts whose actions were replaced by random ones with "
+    "Each circle is the typical return of rollouts whose actions were replaced by random ones with "
     "probability \N{GREEK SMALL LETTER ETA}, measured by the reward that imitation found and "
     "scaled to run from 0 to 1. The line is the curve fitted to them: its values are what the "
     "final rewards are trained to give. It should fall from upper left to lower right and pass "
@@ -93,7 +86,12 @@ def _page(
         pairs("Configuration", flat(config)),
         pairs("Versions", _versions(results)),
     ]
-    return document(f"REPRESENT: {env}", body)
+    return document(f"{_method(config)}: {env}", body)
+
+
+def _method(config: Mapping[str, Any]) -> str:
+    name = str(config.get("method", "represent"))
+    return METHOD_NAMES.get(name, name)
 
 
 def _header(env: Any, config: Mapping[str, Any], results: Mapping[str, Any]) -> str:
@@ -109,20 +107,17 @@ def _header(env: Any, config: Mapping[str, Any], results: Mapping[str, Any]) -> 
         if value is not None
     )
     return (
-        "<header><p>REPRESENT: reward decomposition from suboptimal, heterogeneous "
-        f"demonstrations</p><h1>{text(display_name(str(env)))}</h1>"
+        f"<header><p>{text(_method(config))} on suboptimal, heterogeneous demonstrations</p>"
+        f"<h1>{text(display_name(str(env)))}</h1>"
         f"<ul class=facts>{shown}</ul></header>"
     )
 
 
 def _notices(results: Mapping[str, Any]) -> str:
     notices = []
-    missing = [name for stage, name in _STAGES.items() if not results.get(stage)]
-    if missing:
-        notices.append(
-            f"This run is not finished: no results yet for {', '.join(missing)}. "
-            "The page shows what there is."
-        )
+    # Results are written when the last stage ends.
+    if not results.get("seconds"):
+        notices.append("This run is not finished. The page shows what there is.")
     if results.get("strategies") == 1 and len(tables.targets(results)) > 1:
         notices.append(
             "The demonstrations hold one strategy alone: there is nothing to decompose, and task "

@@ -4,6 +4,15 @@ import math
 
 import numpy as np
 
+METHOD_NAMES = {
+    "represent": "REPRESENT",
+    "ssrr": "SSRR",
+    "msrd": "MSRD",
+    "drex": "D-REX",
+    "bc": "BC",
+    "bc_rnn": "BC-RNN",
+}
+
 
 def display_name(target: str) -> str:
     """Returns "Task" or "Strategy 1" for the target "task" or "strategy_1"."""

@@ -185,7 +185,7 @@ class Graph:
             tracker = self._track(node, self.folder / node.hash) if self._track else None
             with self.directory(node, tracker) as directory:
                 self._outputs[node.hash] = node.run(directory, *inputs)
-        except (RepresentError, ArithmeticError, ValueError, RuntimeError) as error:
+        except Exception as error:
             return f"{type(error).__name__}: {error}"
         seconds = round(time.monotonic() - start, 1)
         with replacing(self._mark(node)) as temporary:

@@ -171,7 +171,7 @@ def append_results(
       method: name of the method.
       config_hash: hash of the run's configuration.
       results: what the method returned, or the part of it that there is so far.
-      only_new: leaves out figures that the file holds for the same run already.
+      only_new: leaves out figures that are the last the file holds for the same run already.
     """
     common = {
         "domain": results["env"],
@@ -183,13 +183,13 @@ def append_results(
         "seconds": sum(results["seconds"].values()),
         **{name: results.get(name, here) for name, here in provenance().items()},
     }
-    held = set()
+    held = {}
     if only_new:
-        names = ("domain", "method", "seed", "preset", "config_hash")
-        same = read_records(path, **{name: common[name] for name in names})
-        held = {(record["target"], record["quantity"]) for record in same}
+        names = ("domain", "method", "seed", "preset")
+        for record in read_records(path, **{name: common[name] for name in names}):
+            held[record["target"], record["quantity"]] = record["config_hash"], record["value"]
     for target, quantity, value in _figures(results):
-        if (target, quantity) not in held:
+        if held.get((target, quantity)) != (config_hash, plain(value)):
             append_record(path, target=target, quantity=quantity, value=value, **common)
 
 

@@ -84,6 +84,13 @@ class AirlConfig:
             True,
         )
 
+    @property
+    def needs_actions(self) -> str:
+        """What needs demonstrated actions: a g that sees them, or a policy that stays a clone."""
+        if not self.discriminator.state_only:
+            return "airl.discriminator.state_only=false"
+        return "" if self.learn_policy else "airl.learn_policy=false"
+
 
 @struct.dataclass
 class AirlState:

@@ -18,8 +18,9 @@ _QUICK_SECONDS = 0.01
 class Painter:
     """Draws one scene; all its methods belong to one thread, as its OpenGL context does.
 
-      Attributes:
-    XX"""
+    Attributes:
+        size: width and height of a picture, in pixels.
+    """
 
     def __init__(self, model: mujoco.MjModel, size: tuple[int, int], camera: str | int = -1):
         """Chooses a view; draws nothing yet.

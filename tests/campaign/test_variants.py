@@ -1,10 +1,16 @@
 """What a campaign runs, and what its runs share."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 
 from represent_jax.campaign.entries import entries
 from represent_jax.campaign.variants import TABLES, VARIANTS, runs_of
+from represent_jax.data.catalogue import load_demonstrations
+from represent_jax.envs import make_env
 from represent_jax.errors import UsageError
+from represent_jax.methods.config import make_problem
 from represent_jax.methods.plan import nodes
 from represent_jax.methods.registry import find_method
 
@@ -86,3 +92,65 @@ def test_policies_of_some_targets_share_all_that_comes_before():
     assert whole.reports["policy_evaluation"].hash != part.reports["policy_evaluation"].hash
     with pytest.raises(UsageError, match="strategy_1"):
         VARIANTS["represent"].config("smoke", "hopper", ["policy_targets=strategy1"])
+
+
+def test_a_variant_stays_what_it_is_and_no_setting_is_dropped_in_silence():
+    overrides = ["regression.lambda_reg=0.3", "msrd.batch_size=9"]
+    config = VARIANTS["no_reg"].config("smoke", "hopper", overrides)
+    assert config.regression.lambda_reg == 0.0
+    assert VARIANTS["represent"].config("smoke", "hopper", overrides).regression.lambda_reg == 0.3
+    with pytest.raises(UsageError, match="unknown setting 'regresion': did you mean regression"):
+        VARIANTS["represent"].config("smoke", "hopper", ["regresion.lambda_reg=9"])
+
+
+def _hashes(config, problem):
+    stages = find_method(config.method).plan(config, problem)
+    return {stage: node.hash for stage, node in nodes(config, problem, stages, "run").items()}
+
+
+def test_judges_and_recurrent_clones_depend_on_pauses_and_other_stages_do_not():
+    env = make_env("half_cheetah", "mujoco")
+    shown = load_demonstrations("half_cheetah")
+    moving, paused = (
+        dataclasses.replace(shown, trajectories=tuple(_beginning(t, n) for t in shown.trajectories))
+        for n in (0, 1)
+    )
+    for variant, same in (
+        ("represent", {"airl", "noise", "curve", "regression", "policies", "selection"}),
+        ("bc_rnn", set()),
+    ):
+        config = VARIANTS[variant].config("smoke", "half_cheetah", ["least_change=1e-6"])
+        config = dataclasses.replace(config, horizon=40)
+        before, after = (
+            _hashes(config, make_problem(config, env, one)) for one in (moving, paused)
+        )
+        assert {stage for stage in before if before[stage] == after[stage]} == same
+
+
+def _beginning(t, num_pauses):
+    """The first 30 steps, after steps in which nothing moves."""
+
+    def paused(x, num):
+        return np.concatenate([*[x[:1]] * num_pauses, x[:num]])
+
+    return dataclasses.replace(
+        t, obs=paused(t.obs, 31), actions=paused(t.actions, 30), rewards=paused(t.rewards, 30)
+    )
+
+
+def test_the_same_reward_under_another_name_is_judged_anew():
+    env = make_env("half_cheetah", "mujoco")
+    shown = load_demonstrations("half_cheetah")
+    first, second = (
+        VARIANTS[name].config("smoke", "half_cheetah", ["num_strategies=1"])
+        for name in ("ssrr", "ssrr_separate")
+    )
+    first, second = (_hashes(one, make_problem(one, env, shown)) for one in (first, second))
+    assert first["airl"] == second["airl"]
+    assert first["reward_evaluation"] != second["reward_evaluation"]
+
+
+def test_a_strategy_alone_keeps_its_name():
+    config = VARIANTS["represent"].config("smoke", "half_cheetah", ["grouping=strategy_2"])
+    assert config.target_names == config.policy_names == ("task", "strategy_2")
+    assert config.group_names == ("strategy_2",)

@@ -16,7 +16,7 @@ from represent_jax.config import apply_overrides
 from represent_jax.data import formats, save_demonstrations
 from represent_jax.data.catalogue import load_test
 from represent_jax.data.trajectories import pad
-from represent_jax.errors import UsageError
+from represent_jax.errors import RepresentError, UsageError
 from represent_jax.methods import results
 from represent_jax.methods.config import make_problem
 from represent_jax.methods.plan import execute
@@ -51,6 +51,7 @@ def shown():
         ("bc_rnn", (), "method=bc_rnn "),
         ("drex", (), r"base=bc \(base=airl does without\)"),
         ("drex", ("base=airl",), ""),
+        ("drex", ("base=airl", "airl.learn_policy=false"), "airl.learn_policy=false"),
         ("msrd", (), ""),
         ("ssrr", (), ""),
         ("represent", (), ""),
@@ -75,6 +76,16 @@ def test_settings_that_observations_do_not_fit_are_refused_before_any_stage(env,
     size = env.observation_size
     with pytest.raises(UsageError, match=rf"task_entries: .*size {size}, found \(0, 99\)"):
         make_problem(config, env, shown)
+
+
+def test_demonstrations_of_another_robot_are_refused_though_their_sizes_fit(shown):
+    config = make_config("smoke", "hopper")
+    hopper = rj.make_env("hopper", "mujoco")
+    states = without(shown, "actions")
+    assert states.obs_dim == hopper.observation_size
+    with pytest.raises(RepresentError, match="are of inverted_double_pendulum, expected hopper"):
+        make_problem(config, hopper, states)
+    make_problem(config, hopper, dataclasses.replace(states, env_name="mine"))
 
 
 def test_test_trajectories(env, shown):

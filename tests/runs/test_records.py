@@ -123,3 +123,23 @@ def test_results_are_recorded_with_the_commit_they_were_found_with(tmp_path):
     found = runs.read_records(path)
     assert [one["commit"] for one in found] == ["earlier", runs.provenance()["commit"]]
     assert found[0]["device"] == runs.provenance()["device"]
+
+
+def test_only_what_is_new_is_recorded_and_a_return_to_earlier_settings_is_new(tmp_path):
+    path = tmp_path / "records.jsonl"
+
+    def append(config_hash, value):
+        results = {
+            **{"env": "hopper", "seed": 0, "preset": "smoke", "backend": "mujoco"},
+            "seconds": {"policies": 2.0},
+            "demonstrators": [{"name": "strategy_1", "return_mean": value}],
+        }
+        records.append_results(path, "represent", config_hash, results, only_new=True)
+        return len(runs.read_records(path))
+
+    assert append("a", 3.0) == 1 and append("a", 3.0) == 1
+    assert append("b", 4.0) == 2
+    # The last line is what tables show.
+    assert append("a", 3.0) == 3 and append("a", 3.0) == 3
+    assert append("a", 5.0) == 4
+    assert append("a", float("nan")) == 5 and append("a", float("nan")) == 5

@@ -1,0 +1,25 @@
+"""What launchers refuse before anything runs."""
+
+import pytest
+from absl import flags
+
+from experiments import launch
+from represent_jax.errors import UsageError
+
+
+def test_settings_are_passed_on():
+    assert launch.overrides(["airl.env_steps=3", "horizon=5"]) == ["airl.env_steps=3", "horizon=5"]
+
+
+@pytest.mark.parametrize("override", ["seed=7", "preset=paper", "method=ssrr", "env=hopper"])
+def test_what_has_a_flag_is_no_override(override):
+    with pytest.raises(UsageError, match=rf"--override {override}: expected a flag for"):
+        launch.overrides(["horizon=5", override])
+
+
+def test_flags_that_would_do_nothing_are_named(monkeypatch):
+    names = ("coordinator", "num_processes", "process")
+    launch.refuse_beside("without --distributed", names)
+    monkeypatch.setattr(flags.FLAGS["process"], "present", 1)
+    with pytest.raises(UsageError, match=r"^--process: without effect without --distributed$"):
+        launch.refuse_beside("without --distributed", names)
