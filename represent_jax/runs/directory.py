@@ -12,6 +12,7 @@ figures/ videos/ report.html
 Of several processes that run one program, the first writes and all read: see `runs.processes`.
 """
 
+import fcntl
 import json
 import math
 import os
@@ -19,7 +20,7 @@ import shutil
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import jax
 import numpy as np
@@ -41,7 +42,7 @@ Tree = TypeVar("Tree")
 
 
 class RunDirectory:
-    """The folder of one run; a context manager that closes its logs.
+    """The folder of one run; a context manager that keeps others out and closes its logs.
 
     Attributes:
         path: the folder.
@@ -53,15 +54,42 @@ class RunDirectory:
         self._tracker = tracker
         self._scalar_logs: dict[str, ScalarLog] = {}
         self._purge_steps: dict[str, int] = {}
+        self._lock: IO | None = None
 
     def __enter__(self) -> "RunDirectory":
+        """Takes the folder for this process.
+
+        Raises:
+            UsageError: another one works in it.
+        """
+        if processes.agreed(not self._take()):
+            raise UsageError(f"{self.path}: another process works in this folder")
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
 
+    def _take(self) -> bool:
+        """Locks the folder until `close`, or until the process ends however it ends."""
+        if not processes.is_first():
+            return True
+        with disk_errors(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = open(self.path / ".lock", "w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._lock.close()
+            return False
+        except OSError:
+            # A file system without locks: as good as none, which nobody else can tell either.
+            logging.debug("%s: cannot be locked", self.path)
+        return True
+
     def close(self) -> None:
-        """Closes the logs."""
+        """Closes the logs, and leaves the folder to others."""
+        if self._lock is not None:
+            self._lock.close()
         for stage in list(self._scalar_logs):
             self._close_scalar_log(stage)
         if self._tracker is not None:

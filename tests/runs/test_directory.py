@@ -47,6 +47,19 @@ def test_open_makes_and_resumes(tmp_path):
     assert runs.load_config_json(path) == {"seed": 0, "sizes": [4, 4], "rate": 0.1}
 
 
+def test_a_folder_belongs_to_one_at_a_time(tmp_path):
+    path = tmp_path / "run"
+    with (
+        runs.open_run(path, Config()),
+        pytest.raises(UsageError, match="run: another process works in this folder"),
+        runs.open_run(path, Config(), resume=True),
+    ):
+        pass
+    # Whoever had it left it, and who was refused took nothing.
+    with runs.open_run(path, Config(), resume=True):
+        pass
+
+
 def test_open_refuses(tmp_path):
     path = tmp_path / "run"
     runs.open_run(path, Config())
