@@ -34,12 +34,12 @@ def run(main: Callable[[list[str]], None]) -> None:
 
 def _guarded(main: Callable[[list[str]], None], argv: list[str]) -> None:
     try:
-        if not _DISTRIBUTED.value:
-            refuse_beside("without --distributed", ("coordinator", "num_processes", "process"))
-        else:
+        if _DISTRIBUTED.value:
             from represent_jax.runs import processes
 
             processes.join(_COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS.value)
+        else:
+            refuse_beside("without --distributed", ("coordinator", "num_processes", "process"))
         main(argv)
     except RepresentError as error:
         if _TRACEBACK.value:

@@ -40,6 +40,12 @@ def require_sizes(sizes: tuple[int, ...], field: str = "hidden_sizes") -> None:
     require(all(size >= 1 for size in sizes), field, "each at least 1", sizes)
 
 
+def require_entries(entries: tuple[int, ...], obs_dim: int, field: str) -> None:
+    """Raises a SettingError unless an observation of this size has all the entries."""
+    expected = f"indices of an observation of size {obs_dim}"
+    require(all(0 <= entry < obs_dim for entry in entries), field, expected, entries)
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """Returns the configuration as nested dictionaries that JSON can hold (tuples become lists)."""
     return {f.name: _plain(getattr(config, f.name)) for f in dataclasses.fields(config)}

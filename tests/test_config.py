@@ -66,7 +66,10 @@ def test_from_dict_fills_defaults_and_widens_ints_to_floats():
             r"agent.bounds: expected tuple\[float, float\], found \[1.0\]",
         ),
         ({"name": "b", "agent": {"hiden": []}}, "unknown setting 'agent.hiden': .*agent.hidden"),
-        ({"name": "b", "agent": {"batch_size": 0}}, "^agent.batch_size: expected a positive int, "),
+        (
+            {"name": "b", "agent": {"batch_size": 0}},
+            "^agent.batch_size: expected a positive int, found 0",
+        ),
     ],
 )
 def test_from_dict_refuses(values, message):

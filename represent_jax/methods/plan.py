@@ -135,17 +135,15 @@ def nodes(
         "demonstrations": _digest(problem.lessons.trajectories),
     }
     # Judges look at what methods do not, pauses and test trajectories.
-    judged = common | {
-        "test": _digest(problem.test),
-        "whole_demonstrations": _digest(problem.demonstrations.trajectories),
-    }
+    whole = common | {"whole_demonstrations": _digest(problem.demonstrations.trajectories)}
+    judged = whole | {"test": _digest(problem.test)}
     made: dict[str, Node] = {}
     for stage in stages:
         made[stage.name] = Node(
             kind=f"{config.env} {stage.name}",
             name=f"{name} {stage.name}",
             settings={
-                **(judged if stage.reports or stage.sees_pauses else common),
+                **(judged if stage.reports else whole if stage.sees_pauses else common),
                 **configs.identity(stage.settings),
             },
             inputs=tuple(made[before] for before in stage.inputs),

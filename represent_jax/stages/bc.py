@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from represent_jax.config import require
+from represent_jax.config import require, require_sizes
 from represent_jax.errors import RepresentError
 from represent_jax.stages.mlp import Mlp, squared_kernels
 from represent_jax.types import Metrics, Params, Transition
@@ -46,12 +46,7 @@ class BcConfig:
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
         for field in ("learning_rate", "kernel_scale"):
             require(getattr(self, field) > 0.0, field, "> 0", getattr(self, field))
-        require(
-            all(size >= 1 for size in self.hidden_sizes),
-            "hidden_sizes",
-            "each at least 1",
-            self.hidden_sizes,
-        )
+        require_sizes(self.hidden_sizes)
         require(self.l2 >= 0.0, "l2", ">= 0", self.l2)
         require(
             0.0 < self.validation_share < 1.0,

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import optax
 from flax import linen, struct
 
-from represent_jax.config import require
+from represent_jax.config import require, require_sizes
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.types import Metrics, Params
 
@@ -80,12 +80,7 @@ class BcRnnConfig:
             "num_modes",
         ):
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
-        require(
-            all(size >= 1 for size in self.mlp_sizes),
-            "mlp_sizes",
-            "each at least 1",
-            self.mlp_sizes,
-        )
+        require_sizes(self.mlp_sizes, "mlp_sizes")
         require(self.learning_rate > 0.0, "learning_rate", "> 0", self.learning_rate)
         heads = tuple(Head)
         require(self.head in heads, "head", f"one of {', '.join(heads)}", self.head)

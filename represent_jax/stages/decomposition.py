@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from represent_jax.config import require
+from represent_jax.config import require_entries
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.stages.mlp import Mlp
 from represent_jax.stages.regression_config import RegressionConfig
@@ -84,12 +84,7 @@ def network(config: RegressionConfig) -> Mlp:
 
 def check_entries(config: RegressionConfig, obs_dim: int) -> None:
     """Raises a UsageError where R^0 is to see entries that an observation does not have."""
-    require(
-        all(entry < obs_dim for entry in config.task_entries),
-        "task_entries",
-        f"indices of an observation of size {obs_dim}",
-        config.task_entries,
-    )
+    require_entries(config.task_entries, obs_dim, "task_entries")
 
 
 def draw(

@@ -19,7 +19,7 @@ from flax import linen, struct
 
 from represent_jax.agents import sac
 from represent_jax.agents.sac import SacConfig
-from represent_jax.config import later, require, require_sizes
+from represent_jax.config import later, require, require_entries, require_sizes
 from represent_jax.envs.episode import Episode
 from represent_jax.envs.skill import SkillConditioned
 from represent_jax.types import Metrics, Params
@@ -105,12 +105,7 @@ def init(key: jax.Array, env: Episode, config: DiaynConfig) -> DiaynState:
       UsageError: the discriminator is to see entries that an observation does not have.
     """
     size = env.observation_size
-    require(
-        all(0 <= entry < size for entry in config.discriminator_obs),
-        "discriminator_obs",
-        f"indices of an observation of size {size}",
-        config.discriminator_obs,
-    )
+    require_entries(config.discriminator_obs, size, "discriminator_obs")
     key_sac, key_reset, key_discriminator = jax.random.split(key, 3)
     conditioned = SkillConditioned(env, config.num_skills)
     skills = jnp.arange(config.sac.num_envs) % config.num_skills
