@@ -55,7 +55,7 @@ class Variant:
 # Figure 5 shows how fast policies learn: from random networks, evaluated often.
 _FROM_SCRATCH = (
     "policies.start=cold",
-    "policies.env_steps=60_000",
+    "policies.env_steps=120_000",
     "policies.eval_env_steps=2_000",
     "policies.sac.warmup_env_steps=1_920",
     "policies.sac.critic_warmup_updates=0",
