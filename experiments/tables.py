@@ -17,7 +17,11 @@ from represent_jax.runs.records import read_records
 
 _TABLE = flags.DEFINE_list("table", ["1"], f"Of {', '.join(tables.TABLES)}.")
 _RECORDS = flags.DEFINE_string("records", "results/records.jsonl", "File of records.")
-_PRESET = flags.DEFINE_string("preset", "paper", "Preset whose records to take.")
+_PRESET = flags.DEFINE_string(
+    "preset",
+    "paper",
+    "Of the records to take; paper_one_phase_1 where Phase 1 was shared.",
+)
 _FORMAT = flags.DEFINE_string("format", "text", f"One of {', '.join(formats.FORMATS)}.")
 _UPDATE = flags.DEFINE_string(
     "update", None, "Markdown page whose tables are written anew; its comments say which."

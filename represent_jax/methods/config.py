@@ -25,6 +25,8 @@ class MethodConfig:
       env: the environment's name.
       preset: name of the preset the settings began as.
       seed: seed of everything after the demonstrations.
+      phase_1_seed: seed of Phase 1 and of its noisy rollouts alone; `seed` if none. Kept while
+        `seed` varies, it is the cheaper protocol of SSRR's authors: one Phase 1, several rewards.
       backend: physics engine.
       num_strategies: strategies used of those demonstrated; the first ones.
       grouping: "separate" keeps strategies apart; "merged" takes all demonstrations for those of
@@ -42,6 +44,7 @@ class MethodConfig:
     env: str = "half_cheetah"
     preset: str = "quick"
     seed: int = 0
+    phase_1_seed: int | None = None
     backend: str = "auto"
     num_strategies: int = 2
     grouping: str = "separate"
@@ -61,8 +64,14 @@ class MethodConfig:
             repr(self.grouping),
         )
         require(self.seed >= 0, "seed", "at least 0", self.seed)
+        require((self.phase_1_seed or 0) >= 0, "phase_1_seed", "at least 0", self.phase_1_seed)
         require(self.horizon >= 0, "horizon", "at least 0", self.horizon)
         require(self.least_change >= 0.0, "least_change", "at least 0", self.least_change)
+
+    @property
+    def protocol(self) -> str:
+        """What records of these settings go by: the preset, and whether Phase 1 is repeated."""
+        return self.preset if self.phase_1_seed is None else f"{self.preset}_one_phase_1"
 
     @property
     def num_groups(self) -> int:

@@ -139,7 +139,7 @@ def plan(
         )
     settings = {"policies": config.policies, "population": config.population}
     return (
-        *first,
+        *(dataclasses.replace(stage, before_rewards=True) for stage in first),
         Stage("preference", prefer, ("noise",), {"preference": config.preference}),
         Stage(
             "reward_evaluation", judge_rewards, ("noise", "preference"), config.names, reports=True

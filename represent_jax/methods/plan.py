@@ -36,6 +36,7 @@ class Stage:
       settings: what the output depends on beside the problem, the seed and the inputs.
       reports: whether the output is a part of the run's results.
       sees_pauses: whether it learns from whole demonstrations, `Problem.demonstrations`.
+      before_rewards: whether rewards are learned from it, so that its seed is Phase 1's.
     """
 
     name: str
@@ -44,11 +45,18 @@ class Stage:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     reports: bool = False
     sees_pauses: bool = False
+    before_rewards: bool = False
 
 
 def stage_key(seed: int, name: str) -> jax.Array:
     """The key of a stage."""
     return jax.random.fold_in(jax.random.PRNGKey(seed), zlib.crc32(name.encode()))
+
+
+def seed_of(config: MethodConfig, stage: Stage) -> int:
+    """The seed of a stage: the run's own, unless the settings give Phase 1 another."""
+    own = config.phase_1_seed if stage.before_rewards else None
+    return config.seed if own is None else own
 
 
 def run_stage(seed: int, stage: Stage, directory: RunDirectory, *inputs: Any) -> Any:
@@ -106,7 +114,7 @@ def execute(
     for stage in stages:
         with clock(stage.name):
             inputs = (outputs[before] for before in stage.inputs)
-            outputs[stage.name] = run_stage(config.seed, stage, directory, *inputs)
+            outputs[stage.name] = run_stage(seed_of(config, stage), stage, directory, *inputs)
         if stage.name == until != stages[-1].name:
             return None
     results = describe(config, problem)
@@ -131,7 +139,6 @@ def nodes(
         "env": config.env,
         "backend": problem.env.backend,
         "horizon": problem.env.horizon,
-        "seed": config.seed,
         "demonstrations": _digest(problem.lessons.trajectories),
     }
     # Judges look at what methods do not, pauses and test trajectories.
@@ -143,11 +150,12 @@ def nodes(
             kind=f"{config.env} {stage.name}",
             name=f"{name} {stage.name}",
             settings={
+                "seed": seed_of(config, stage),
                 **(judged if stage.reports else whole if stage.sees_pauses else common),
                 **configs.identity(stage.settings),
             },
             inputs=tuple(made[before] for before in stage.inputs),
-            run=functools.partial(run_stage, config.seed, stage),
+            run=functools.partial(run_stage, seed_of(config, stage), stage),
         )
     return made
 

@@ -4,6 +4,7 @@ demonstrations -> airl -> noise -> curve -> regression -> policies -> selection,
 ends
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import jax
@@ -58,12 +59,13 @@ def first_stages(
     def fit(key, directory, first, noisy):
         return pipeline.fit_curves(config, problem, first, noisy)
 
-    return (
+    stages = (
         Stage("airl", imitate, (), {"airl": config.airl, "population": config.population}),
         Stage("airl_evaluation", judge_imitation, ("airl",), reports=True),
         Stage("noise", roll_out, ("airl",), {"noise": config.noise}),
         Stage("curve", fit, ("airl", "noise"), {"curve": config.curve}),
     )
+    return tuple(dataclasses.replace(stage, before_rewards=True) for stage in stages)
 
 
 def last_stages(

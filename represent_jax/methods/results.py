@@ -48,7 +48,7 @@ def describe(config: MethodConfig, problem: Problem) -> dict[str, Any]:
 
     return {
         "env": config.env,
-        "preset": config.preset,
+        "preset": config.protocol,
         "seed": config.seed,
         "backend": problem.env.backend,
         "method": config.method,

@@ -11,8 +11,10 @@ from represent_jax.data.catalogue import load_demonstrations
 from represent_jax.envs import make_env
 from represent_jax.errors import UsageError
 from represent_jax.methods.config import make_problem
-from represent_jax.methods.plan import nodes
+from represent_jax.methods.plan import Stage, execute, nodes, stage_key
 from represent_jax.methods.registry import find_method
+from represent_jax.methods.results import describe
+from represent_jax.runs import open_run
 
 
 def test_runs_of_tables_are_their_union():
@@ -79,8 +81,38 @@ def test_every_stage_depends_on_the_seed(hashes):
             assert value != hashes[variant, grouping, 1, stage]
 
 
-def _run(variant):
-    return [variant, "separate", 0]
+def test_one_phase_1_serves_all_seeds_under_a_name_of_its_own(hashes):
+    overrides = ["phase_1_seed=0"]
+    first = ("airl", "airl_evaluation", "noise", "curve")
+    (entry,) = entries(["1"], ["half_cheetah"], [1], "smoke", overrides, ["represent"])
+    for stage, value in _hashes(entry.config, entry.problem).items():
+        seed = 0 if stage in first else 1
+        shared = value == hashes[*_run("represent", seed), stage]
+        assert shared == (stage in first)
+    assert describe(entry.config, entry.problem)["preset"] == "smoke_one_phase_1"
+    with pytest.raises(UsageError, match="phase_1_seed"):
+        entries(["1"], ["half_cheetah"], [1], "smoke", ["phase_1_seed=-1"])
+
+
+def test_a_stage_draws_from_the_seed_that_it_is_found_by(tmp_path):
+    config = VARIANTS["represent"].config("smoke", "half_cheetah", ["seed=1", "phase_1_seed=5"])
+    drawn = []
+
+    def draw(key, directory, *_):
+        drawn.append(key)
+        return {}
+
+    stages = (Stage("airl", draw, before_rewards=True), Stage("regression", draw, ("airl",)))
+    problem = make_problem(
+        config, make_env("half_cheetah", "mujoco"), load_demonstrations("half_cheetah")
+    )
+    with open_run(tmp_path, {}) as run:
+        execute(config, problem, stages, run)
+    assert np.array_equal(drawn, [stage_key(5, "airl"), stage_key(1, "regression")])
+
+
+def _run(variant, seed=0):
+    return [variant, "separate", seed]
 
 
 def test_policies_of_some_targets_share_all_that_comes_before():
