@@ -11,11 +11,12 @@ from absl import flags
 
 from experiments import launch
 from represent_jax.agents import rollout
-from represent_jax.api import load_config, load_policy, load_reward
+from represent_jax.api import load_config, load_reward
 from represent_jax.data.catalogue import load_test
 from represent_jax.data.trajectories import pad
 from represent_jax.envs import Episode, make_env
 from represent_jax.errors import UsageError
+from represent_jax.methods.registry import find_method
 from represent_jax.report import tables
 from represent_jax.report.values import display_name, format_number
 from represent_jax.runs import RunDirectory
@@ -43,11 +44,14 @@ def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     config = load_config(_RUN.value)
     reward = load_reward(_RUN.value)
-    env = make_env(config.env, _BACKEND.value or config.backend)
-    env = Episode(env, config.horizon or env.horizon, auto_reset=False)
+    robot = make_env(config.env, _BACKEND.value or config.backend)
+    env = Episode(robot, config.horizon or robot.horizon, auto_reset=False)
     data = load_test(config.env, _TRAJECTORIES.value or config.test)
-    has_policies = RunDirectory(_RUN.value).is_done("policies")
-    if data is None and not has_policies:
+    method, directory = find_method(config.method), RunDirectory(_RUN.value)
+    policies = {}
+    if directory.is_done(method.policies_in):
+        policies = method.load_policies(config, robot, directory)
+    if data is None and not policies:
         raise UsageError(f"no trajectories of {config.env} ship: give some with --trajectories")
     batch, columns = None, ("target",)
     if data is not None:
@@ -57,7 +61,7 @@ def main(argv: list[str]) -> None:
         batch = pad(data.trajectories, max(t.length for t in data.trajectories))
         columns += ("Pearson", "Spearman")
     targets = config.target_names
-    if has_policies:
+    if policies:
         columns += ("true return", "std", "learned return", "std")
     rows = []
     for target in targets:
@@ -70,10 +74,9 @@ def main(argv: list[str]) -> None:
             returns = rollout.learned_returns(batch, learned, None)
             found = evaluation.correlate(rollout.true_returns(batch), returns)
             row += [format_number(float(x), 3) for x in found]
-        if has_policies and target in config.policy_names:
-            policy = load_policy(_RUN.value, target)
+        if target in policies:
             episodes = jax.jit(
-                lambda key, policy=policy: rollout.rollout(
+                lambda key, policy=policies[target]: rollout.rollout(
                     env,
                     lambda _, obs_t, key: policy(obs_t),
                     None,

@@ -26,15 +26,22 @@ _NUM_PROCESSES = flags.DEFINE_integer("num_processes", 0, "Number of processes."
 _PROCESS = flags.DEFINE_integer("process", -1, "Number of this process, from 0.")
 
 
-def run(main: Callable[[list[str]], None]) -> None:
-    """Runs a launcher; errors of use and of data end it with one line and their exit code."""
+def run(main: Callable[[list[str]], None], distributed: bool = False) -> None:
+    """Runs a launcher; errors of use and of data end it with one line and their exit code.
+
+    Args:
+      main: what it does.
+      distributed: whether several processes may do it together.
+    """
     logging.set_verbosity(logging.WARNING)
-    app.run(lambda argv: _guarded(main, argv))
+    app.run(lambda argv: _guarded(main, argv, distributed))
 
 
-def _guarded(main: Callable[[list[str]], None], argv: list[str]) -> None:
+def _guarded(main: Callable[[list[str]], None], argv: list[str], distributed: bool) -> None:
     try:
         if _DISTRIBUTED.value:
+            if not distributed:
+                raise UsageError("--distributed: expected experiments.represent, others run alone")
             from represent_jax.runs import processes
 
             processes.join(_COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS.value)

@@ -122,4 +122,4 @@ def _run(config: MethodConfig, out: str) -> None:
 
 
 if __name__ == "__main__":
-    launch.run(main)
+    launch.run(main, distributed=True)

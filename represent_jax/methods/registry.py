@@ -26,6 +26,7 @@ class Method(NamedTuple):
       plan: its stages, `plan(config, problem, checkpoint_seconds)`, for `methods.plan`.
       load_rewards, load_policies: from settings, environment and run directory to functions
         `reward(obs_t, action_t, next_obs_t)` and `policy(obs)`, by target.
+      policies_in: the stage whose output holds the policies.
       configure: turns the settings of a preset and a domain, by name, into the method's.
     """
 
@@ -33,6 +34,7 @@ class Method(NamedTuple):
     plan: Callable[..., tuple[Stage, ...]]
     load_rewards: Loader
     load_policies: Loader
+    policies_in: str = "policies"
     configure: Callable[[dict[str, Any]], dict[str, Any]] = _unchanged
 
 
@@ -62,18 +64,21 @@ METHODS: dict[str, Method] = {
         plan=msrd.plan,
         load_rewards=msrd.load_rewards,
         load_policies=msrd.load_policies,
+        policies_in="msrd",
     ),
     "bc": Method(
         config=cloning.BcMethodConfig,
         plan=cloning.plan_bc,
         load_rewards=cloning.load_no_rewards,
         load_policies=cloning.load_bc_policies,
+        policies_in="bc",
     ),
     "bc_rnn": Method(
         config=cloning.BcRnnMethodConfig,
         plan=cloning.plan_bc_rnn,
         load_rewards=cloning.load_no_rewards,
         load_policies=cloning.load_no_recurrent_policies,
+        policies_in="bc_rnn",
     ),
 }
 

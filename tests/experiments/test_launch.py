@@ -2,6 +2,7 @@
 
 import pytest
 from absl import flags
+from absl.testing import flagsaver
 
 from experiments import launch
 from represent_jax.errors import UsageError
@@ -15,6 +16,13 @@ def test_settings_are_passed_on():
 def test_what_has_a_flag_is_no_override(override):
     with pytest.raises(UsageError, match=rf"--override {override}: expected a flag for"):
         launch.overrides(["horizon=5", override])
+
+
+def test_a_launcher_that_runs_alone_refuses_other_processes(capsys):
+    flags.FLAGS.mark_as_parsed()
+    with flagsaver.flagsaver(distributed=True), pytest.raises(SystemExit):
+        launch._guarded(lambda argv: pytest.fail("it ran"), [], distributed=False)
+    assert "--distributed: expected experiments.represent" in capsys.readouterr().err
 
 
 def test_flags_that_would_do_nothing_are_named(monkeypatch):

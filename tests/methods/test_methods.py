@@ -1,10 +1,12 @@
 """Every method from demonstrations to what it returns, with tiny budgets."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
-from launcher import finish, launch, log_of, results_of
+from launcher import ROOT, finish, launch, log_of, results_of
 
 import represent_jax as rj
 from represent_jax import runs
@@ -72,3 +74,8 @@ def test_baselines_run_to_their_end(tmp_path, method):
     else:
         target = next(iter(results["policies"]))
         assert rj.load_policy(out, target)(obs).shape == (3, 6)
+    if method == "msrd":
+        command = [sys.executable, "-m", "experiments.evaluate", f"--run={out}", "--episodes=2"]
+        said = subprocess.check_output([*command, "--backend=mujoco"], cwd=ROOT, text=True)
+        rows = {line[:10].strip(): line.split() for line in said.splitlines() if line.strip()}
+        assert rows["Task"][-1] == "-" and rows["Strategy 2"][-1] != "-", said
