@@ -44,7 +44,8 @@ def make_env(name: str, backend: str = "auto", **task_options) -> base.Env:
       name: a registered task, such as "half_cheetah"; "module:Class" of a `Task` that Python can
         import, such as "my_robots:Swimmer"; or "playground:Name" of a MuJoCo Playground
         environment, such as "playground:CartpoleBalance".
-      backend: "mujoco" (C, for CPU hosts), "mjx" (XLA, for accelerators) or "auto".
+      backend: "mujoco" (C, for CPU hosts), "mjx" (XLA, for accelerators) or "auto", which
+        picks by platform, but always "mujoco" where the task's scene for MJX is another.
       **task_options: passed to the task, such as `terminates=False`.
 
     Returns:
@@ -63,7 +64,8 @@ def make_env(name: str, backend: str = "auto", **task_options) -> base.Env:
         task = make_task(**task_options)
     except TypeError as error:
         raise UsageError(f"environment {name!r}: {error}") from error
-    backend = resolve_backend(backend)
+    # Episodes of a light scene are not those of the full one: they have to be asked for.
+    backend = "mujoco" if backend == "auto" and task.has_light_model else resolve_backend(backend)
     model = task.load_light_model() if backend == "mjx" else task.load_model()
     engine = make_engine(backend, model, task.frame_skip, task.derived_fields, task.mjx_solver)
     return Environment(task, engine)

@@ -45,8 +45,16 @@ class Task(abc.ABC):
         """Compiles the scene."""
 
     def load_light_model(self) -> mujoco.MjModel:
-        """Compiles the scene for engines that few and simple geoms suit; often the same."""
+        """Compiles the scene for engines that few and simple geoms suit; often the same.
+
+        Where it is another, `backend="auto"` never picks such an engine.
+        """
         return self.load_model()
+
+    @property
+    def has_light_model(self) -> bool:
+        """Whether the light scene is another than the full one."""
+        return type(self).load_light_model is not Task.load_light_model
 
     @abc.abstractmethod
     def reset(self, key: jax.Array, init_qpos: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -46,29 +46,43 @@ def make_kitchen(noisy=False, name="franka_kitchen"):
 
 
 @functools.cache
-def demonstrated_states():
-    """Positions, velocities and actions of a push, while the kettle moves."""
-    demonstration = rj.load_demonstrations("franka_kitchen").of_strategy(0)[0]
-    obs, actions = demonstration.obs[:-1], demonstration.actions
-    moving = np.flatnonzero(np.linalg.norm(obs[:, 53:55], axis=1) > 0.005)
-    chosen = moving[:: max(1, len(moving) // 40)]
+def demonstrated_states(strategy=0):
+    """Positions, velocities and actions of demonstrations while the kettle moves, 64 states."""
+    demonstrations = rj.load_demonstrations("franka_kitchen").of_strategy(strategy)
+    obs = np.concatenate([demonstration.obs[:-1] for demonstration in demonstrations])
+    actions = np.concatenate([demonstration.actions for demonstration in demonstrations])
+    moving = np.flatnonzero(np.linalg.norm(obs[:, 53:56], axis=1) > 0.005)
+    chosen = moving[np.linspace(0, len(moving) - 1, 64).astype(int)]
     obs = obs[chosen]
     qpos = np.hstack([obs[:, :9], obs[:, 18:39]])
     qvel = np.hstack([obs[:, 9:18], obs[:, 39:59]])
-    return jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(actions[chosen])
+    return qpos, qvel, actions[chosen]
 
 
-def step_from(env, qpos, qvel, actions, compiler_options=None):
-    """One step of many scenes from given states."""
+def make_step(env, compiler_options=None):
+    """Observations and rewards after one step of many scenes from given states, compiled."""
 
     @functools.partial(jax.jit, compiler_options=compiler_options)
     @jax.vmap
     def step(qpos, qvel, action):
         physics = env.engine.init(qpos, qvel)
         zero = jnp.zeros(())
-        return env.step(base.State(physics, env.task.observe(physics), zero, zero), action)
+        state = env.step(base.State(physics, env.task.observe(physics), zero, zero), action)
+        return state.obs, state.reward
 
-    return step(qpos, qvel, actions)
+    return step
+
+
+@pytest.fixture(scope="module")
+def step_full():
+    return make_step(make_kitchen())
+
+
+@pytest.fixture(scope="module")
+def step_light():
+    # XLA's fused loops compute a link's pose anew for every link behind it.
+    options = {"xla_cpu_use_fusion_emitters": False}
+    return make_step(make_env("franka_kitchen", "mjx"), options)
 
 
 def test_start_and_layout_are_the_sources():
@@ -81,13 +95,13 @@ def test_start_and_layout_are_the_sources():
     assert env.engine.dt == pytest.approx(source.robot_env.dt) == pytest.approx(0.08)
 
 
-def test_a_step_is_that_of_the_unedited_model():
+def test_a_step_is_that_of_the_unedited_model(step_full):
     """Control law and substeps of the source's own robot, from states of a demonstration."""
     robot, env = make_source().robot_env, make_kitchen()
     qpos, qvel, _ = demonstrated_states()
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1.5, 1.5, (len(qpos), 9)).astype(np.float32)
-    after = step_from(env, qpos, qvel, actions)
+    after, reward = step_full(qpos, qvel, actions)
     expected = []
     for q, v, action in zip(np.float64(qpos), np.float64(qvel), actions, strict=True):
         mujoco.mj_resetData(robot.model, robot.data)
@@ -100,10 +114,10 @@ def test_a_step_is_that_of_the_unedited_model():
         robot.do_simulation(target, robot.frame_skip)
         q, v = robot.data.qpos, robot.data.qvel
         expected.append(np.concatenate([q[:9], v[:9], q[9:], v[9:]]))
-    error = np.abs(after.obs - np.stack(expected)) / np.maximum(1.0, np.abs(expected))
+    error = np.abs(after - np.stack(expected)) / np.maximum(1.0, np.abs(expected))
     assert error.max() <= 1e-4
-    distance = np.linalg.norm(after.obs[:, 32:35] - KETTLE_GOAL, axis=1)
-    np.testing.assert_allclose(after.reward, -distance, rtol=1e-5)
+    distance = np.linalg.norm(after[:, 32:35] - KETTLE_GOAL, axis=1)
+    np.testing.assert_allclose(reward, -distance, rtol=1e-5)
 
 
 def test_noise_is_the_sources_and_reaches_the_control():
@@ -129,21 +143,35 @@ def test_noise_is_the_sources_and_reaches_the_control():
     assert np.all(seen[0, :18] != seen[1, :18]) and np.all(seen[1, :18] != seen[2, :18])
 
 
-def test_64_light_scenes_step_under_jit_and_push_the_kettle_nearly_as_the_full_one():
-    """One step from each state of a push: MJX's light scene against C MuJoCo's whole kitchen."""
-    qpos, qvel, actions = (jnp.resize(x, (64, x.shape[1])) for x in demonstrated_states())
-    light = make_env("franka_kitchen", "mjx")
-    full = step_from(make_kitchen(), qpos, qvel, actions)
+# Bounds on the median, the 90 % quantile and the largest of 64 differences; joints are in rad,
+# fingers in m. Measured ones are in BUILD_NOTES.md.
+@pytest.mark.parametrize(
+    ("strategy", "millimetres", "degrees", "joints"),
+    [
+        pytest.param(0, (0.6, 0.9, 4.0), (0.12, 0.3, 3.0), (0.003, 0.004, 0.006), id="pushing"),
+        pytest.param(1, (2.7, 3.5, 4.5), (1.1, 1.5, 2.2), (0.0035, 0.011, 0.024), id="holding"),
+    ],
+)
+def test_64_light_scenes_step_under_jit_and_move_the_kettle_nearly_as_the_full_one(
+    step_full, step_light, strategy, millimetres, degrees, joints
+):
+    """One step from each state of demonstrations: MJX's light scene against the whole kitchen."""
+    qpos, qvel, actions = demonstrated_states(strategy)
     keep_q, keep_v = np.r_[0:9, 23:30], np.r_[0:9, 23:29]
-    # XLA's fused loops compute a link's pose anew for every link behind it.
-    options = {"xla_cpu_use_fusion_emitters": False}
-    found = step_from(light, qpos[:, keep_q], qvel[:, keep_v], actions, options)
-    assert found.obs.shape == full.obs.shape == (64, 59)
-    np.testing.assert_array_equal(found.obs[:, 39:53], 0.0)  # speeds of what does not move
-    error = 1e3 * np.linalg.norm(full.obs[:, 32:35] - found.obs[:, 32:35], axis=1)
-    assert np.median(error) <= 1.0 and error.max() <= 3.0, (np.median(error), error.max())
-    joints = np.abs(full.obs[:, :9] - found.obs[:, :9]).max(axis=1)
-    assert np.median(joints) <= 4e-3 and joints.max() <= 0.02, (np.median(joints), joints.max())
+    full = np.asarray(step_full(qpos, qvel, actions)[0])
+    found = np.asarray(step_light(qpos[:, keep_q], qvel[:, keep_v], actions)[0])
+    assert found.shape == full.shape == (64, 59)
+    np.testing.assert_array_equal(found[:, 39:53], 0.0)  # speeds of what does not move
+    turns = full[:, 35:39], found[:, 35:39]
+    one, other = (turn / np.linalg.norm(turn, axis=1, keepdims=True) for turn in turns)
+    half_sine = 0.5 * np.linalg.norm(one - other, axis=1)
+    for differences, bounds in (
+        (1e3 * np.linalg.norm(full[:, 32:35] - found[:, 32:35], axis=1), millimetres),
+        (np.rad2deg(4.0 * np.arcsin(half_sine)), degrees),
+        (np.abs(full[:, :9] - found[:, :9]).max(axis=1), joints),
+    ):
+        measured = np.quantile(differences, [0.5, 0.9, 1.0])
+        assert np.all(measured <= bounds), (measured, bounds)
 
 
 def test_the_light_scene_keeps_masses_and_what_collides():

@@ -208,6 +208,24 @@ def test_own_task_runs_on_both_engines(reach, backend):
     assert np.all(ended.info["steps"] < 20)
 
 
+class LightReach(Reach):
+    """The same with a scene for MJX that is another."""
+
+    def load_light_model(self):
+        return mujoco.MjModel.from_xml_string(RAIL.replace('mass="1"', 'mass="2"'))
+
+
+@pytest.mark.parametrize("platform", ["cpu", "gpu", "tpu"])
+def test_auto_never_picks_another_scene(reach, monkeypatch, platform):
+    register(LightReach, "light_reach")
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    env = make_env("light_reach")
+    assert env.backend == "mujoco" and env.engine.model.body_mass[1] == 1.0
+    asked = make_env("light_reach", "mjx")
+    assert asked.backend == "mjx" and asked.engine.model.body_mass[1] == 2.0
+    assert make_env("reach").backend == ("mujoco" if platform == "cpu" else "mjx")
+
+
 def test_taken_name_is_refused(reach):
     with pytest.raises(UsageError, match="'reach' is already registered"):
         register(Reach, "reach")

@@ -63,6 +63,31 @@ def test_keys_in_a_browser_move_the_robot_and_episodes_are_saved(tmp_path):
         assert not console
 
 
+def test_a_key_in_a_browser_moves_the_arm_of_the_kitchen(tmp_path):
+    pytest.importorskip("gymnasium_robotics", reason="needs the extra 'kitchen'")
+    # Without a graphics card pictures of the kitchen are slow: few and small ones.
+    pictures = ("--width=64", "--height=64", "--fps=2")
+    with (
+        chromium(tmp_path / "profile") as driver,
+        launched("franka_kitchen", tmp_path, "--horizon=25", *pictures) as (_, address),
+    ):
+        driver.get(address)
+        page = TeleoperationPage(driver)
+        page.until_phase("ready")
+        assert "move forward" in page.text("keys")
+        drive_until_over(page, "w")
+        page.click("save")
+        page.until(lambda: page.text("notice") == "Saved as episode 1, strategy 1.")
+    demonstrations = load_demonstrations(tmp_path / "demonstrations" / "franka_kitchen.npz")
+    assert demonstrations.env_name == "franka_kitchen"
+    (trajectory,) = demonstrations.trajectories
+    assert trajectory.obs.shape == (26, 59)
+    assert trajectory.actions.shape == (25, 9) and trajectory.rewards.shape == (25,)
+    # Without the key all joints stay within 0.03 rad of where they are.
+    moved = np.abs(trajectory.obs[-1, :7] - trajectory.obs[0, :7])
+    assert moved.max() > 0.3 and np.sum(moved > 0.1) >= 2, moved
+
+
 def test_the_page_says_when_the_server_is_gone(tmp_path):
     with (
         chromium(tmp_path / "profile") as driver,

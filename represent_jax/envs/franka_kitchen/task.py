@@ -13,7 +13,6 @@ from represent_jax.physics.mjx import MjxSolver
 
 NUM_JOINTS = 9
 NUM_FIXTURES = 14
-OBS_DIM = 59
 
 # Where FrankaKitchen-v1 starts: arm and fingers, fixtures, kettle (its quaternion as it is there).
 ARM_START = np.array(
