@@ -21,6 +21,7 @@ class Contents(NamedTuple):
         curves: the noise-performance curve, by strategy.
         points: true and learned returns [n], by target and group of trajectories.
         learning: "env_steps", "true_return" and "learned_return" [num_evals], by target.
+        losses: the regression's loss as it was logged, mean over rewards [num_logs].
     """
 
     run: RunDirectory
@@ -29,6 +30,7 @@ class Contents(NamedTuple):
     curves: dict[str, dict[str, Any]]
     points: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]
     learning: dict[str, dict[str, np.ndarray]]
+    losses: np.ndarray
 
 
 def load(run_path: str | os.PathLike) -> Contents:
@@ -49,7 +51,15 @@ def load(run_path: str | os.PathLike) -> Contents:
         curves=dict(zip(tables.groups(results), results.get("curve") or (), strict=False)),
         points=_scatter_points(_arrays(run, "scatter")),
         learning=_learning_curves(_arrays(run, "learning_curves")),
+        losses=_losses(run),
     )
+
+
+def _losses(run: RunDirectory) -> np.ndarray:
+    lines = run.read_log("regression")
+    # A line may be from before a kill, and its step logged again.
+    by_step = {line["step"]: np.mean(line["ssrr_loss"]) for line in lines if "ssrr_loss" in line}
+    return np.asarray([by_step[step] for step in sorted(by_step)], np.float64)
 
 
 def _arrays(run: RunDirectory, name: str) -> dict[str, np.ndarray]:

@@ -1,7 +1,7 @@
 """Verdicts on a run: each stage's question, answered in a sentence from the run's own numbers."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,21 +32,26 @@ class Verdict(NamedTuple):
 
 
 def verdicts(
-    results: Mapping[str, Any], learning_curves: Mapping[str, Mapping[str, np.ndarray]]
+    results: Mapping[str, Any],
+    learning_curves: Mapping[str, Mapping[str, np.ndarray]],
+    losses: Sequence[float] | np.ndarray = (),
 ) -> list[Verdict]:
     """Returns the verdicts that the stages done so far allow, in the order of the stages.
 
     Args:
         results: what results.json holds.
         learning_curves: by target, "env_steps", "true_return" and "learned_return" [num_evals].
+        losses: the regression's loss while it was trained, at equal distances [num_logs].
     """
     found = [
         imitation(results),
         noise_curve(results),
+        floor(losses),
         sharing(results),
         unseen(results),
         extrapolation(results),
         improvement(results),
+        maximised(learning_curves),
         path(results, learning_curves),
     ]
     return [verdict for verdict in found if verdict is not None]
@@ -70,6 +75,10 @@ def imitation(results: Mapping[str, Any]) -> Verdict | None:
     details = {
         t: f"{100 * share:.0f} % of the demonstrator's return" for t, share in shares.items()
     }
+    for target, one in zip(groups(results), results.get("airl") or (), strict=False):
+        if target in details and one.get("pearson_test") is not None:
+            known = format_correlation(one["pearson_test"])
+            details[target] += f"; its reward's r on unseen trajectories {known}"
     levels_found = {t: _grade(share, 0.9, 0.7) for t, share in shares.items()}
     return _verdict(
         "Is the imitation at the demonstrator's level?", levels_found, sentences, details
@@ -98,6 +107,25 @@ def noise_curve(results: Mapping[str, Any]) -> Verdict | None:
         "along a sigmoid, so the ranking that Phase 3 learns from is weak.",
     }
     return _verdict("Does the noise curve fall, and fit?", graded, sentences, details)
+
+
+def floor(losses: Sequence[float] | np.ndarray) -> Verdict | None:
+    """Is the regression's loss at its floor? The last fifth of the updates against that before."""
+    fifth = len(losses) // 5
+    if not fifth:
+        return None
+    last, before = np.mean(losses[-fifth:]), np.mean(losses[-2 * fifth : -fifth])
+    falls = float(1.0 - last / before) if before > 0.0 else 0.0
+    if not math.isfinite(falls):
+        return None
+    graded = {"loss": GOOD if falls < 0.1 else FAIR}
+    sentences = {
+        GOOD: "Yes: the last fifth of the updates hardly changed it.",
+        FAIR: "Not quite: it still fell in the last fifth of the updates. A lower loss need not "
+        "rank unseen trajectories better; compare with more regression.num_updates.",
+    }
+    details = {"loss": f"{last:.3g} in the last fifth of the updates, {before:.3g} in that before"}
+    return _verdict("Is the regression's loss at its floor?", graded, sentences, details)
 
 
 def sharing(results: Mapping[str, Any]) -> Verdict | None:
@@ -173,6 +201,29 @@ def improvement(results: Mapping[str, Any]) -> Verdict | None:
         POOR: "No: at least one policy is below its demonstrators.",
     }
     return _verdict("Do the policies surpass the demonstrators?", graded, sentences, details)
+
+
+def maximised(learning_curves: Mapping[str, Mapping[str, np.ndarray]]) -> Verdict | None:
+    """Do the agents maximise the rewards they are given, whatever these are worth?"""
+    graded, details = {}, {}
+    for target, curve in learning_curves.items():
+        learned = np.asarray(curve["learned_return"], np.float64)
+        if len(learned) < 3 or not np.isfinite(learned).all():
+            continue
+        first, last, best = learned[0], learned[-1], float(np.max(learned))
+        graded[target] = POOR if best <= first else GOOD if _share(last, best) >= 0.9 else FAIR
+        details[target] = (
+            f"learned return {format_number(first)} at the first evaluation, "
+            f"{format_number(best)} at best, {format_number(last)} at the last"
+        )
+    sentences = {
+        GOOD: "Yes: the learned return rises, and stays up.",
+        FAIR: "Partly: it rises and falls again, so the policy kept is from before the end. A "
+        "smaller step size, or a larger policies.sac.prior_weight, steadies it.",
+        POOR: "No: for at least one reward no policy is better than the first one evaluated. Look "
+        "at the critics' loss in the log.",
+    }
+    return _verdict("Do the agents maximise their rewards?", graded, sentences, details)
 
 
 def path(

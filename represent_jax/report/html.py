@@ -4,17 +4,21 @@ One file that needs no network; only videos, where there are any, lie beside it.
 """
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from represent_jax.data.atomic import replacing
 from represent_jax.report import contents, diagnostics, figures, showcase, tables
 from represent_jax.report.page import document, flat, gallery, pairs, table, text
-from represent_jax.report.values import METHOD_NAMES, display_name, format_number
+from represent_jax.report.values import (
+    METHOD_NAMES,
+    display_name,
+    format_duration,
+    format_number,
+)
 from represent_jax.runs.records import provenance
 
 _CURVES_NOTE = (
@@ -35,6 +39,12 @@ _LEARNING_NOTE = (
     "demonstrators (red lines); below, the learned return that it maximises, in its own units. "
     "Both should rise together, and the upper one should end above the red lines."
 )
+# How files begin to say where they are from if `experiments.make_demonstrations` drove the robot.
+_SCRIPTED = "scripted operators"
+_SCRIPTED_NOTE = (
+    "Scripted operators, not people, drove the robot: programs that press the keys of the same "
+    "interface that a person would use."
+)
 
 
 def write_report(run_path: str | os.PathLike) -> Path:
@@ -45,7 +55,7 @@ def write_report(run_path: str | os.PathLike) -> Path:
     Raises:
         RepresentError: the folder holds no run, or its results cannot be read or written to.
     """
-    run, config, results, curves, points, learning = contents.load(run_path)
+    run, config, results, curves, points, learning, losses = contents.load(run_path)
     levels = tables.demonstrator_levels(results)
 
     drawn = {
@@ -59,7 +69,8 @@ def write_report(run_path: str | os.PathLike) -> Path:
 
     page = run.path / "report.html"
     with replacing(page) as temporary:
-        page_html = _page(config, results, learning, drawn, showcase.read(run))
+        answers = diagnostics.verdicts(results, learning, losses)
+        page_html = _page(config, results, answers, drawn, showcase.read(run))
         temporary.write_text(page_html, encoding="utf-8")
     return page
 
@@ -67,7 +78,7 @@ def write_report(run_path: str | os.PathLike) -> Path:
 def _page(
     config: Mapping[str, Any],
     results: Mapping[str, Any],
-    learning: Mapping[str, Mapping[str, np.ndarray]],
+    answers: Sequence[diagnostics.Verdict],
     drawn: Mapping[str, Mapping[str, Figure]],
     shown: showcase.Showcase | None,
 ) -> str:
@@ -75,7 +86,7 @@ def _page(
     body = [
         _header(env, config, results),
         _notices(results),
-        _verdicts(diagnostics.verdicts(results, learning)),
+        _verdicts(answers),
         table(tables.returns_table(results)),
         gallery("Policies", drawn["learning"], _LEARNING_NOTE, "Learning curves"),
         _videos(shown),
@@ -98,7 +109,7 @@ def _header(env: Any, config: Mapping[str, Any], results: Mapping[str, Any]) -> 
     facts = [(key, results.get(key, config.get(key))) for key in ("preset", "seed", "backend")]
     facts.append(("strategies", results.get("strategies")))
     seconds = sum(value for value in (results.get("seconds") or {}).values() if value)
-    facts.append(("time", _duration(seconds) if seconds else None))
+    facts.append(("time", format_duration(seconds) if seconds else None))
     memory = results.get("peak_memory_gib")
     facts.append(("peak memory", None if memory is None else f"{format_number(memory, 1)} GiB"))
     shown = "".join(
@@ -123,8 +134,20 @@ def _notices(results: Mapping[str, Any]) -> str:
             "The demonstrations hold one strategy alone: there is nothing to decompose, and task "
             "and strategy reward may share what was learned in any way."
         )
+    notices += _source(results)
     notices += tables.missing(results)
     return "".join(f"<p class=notice>{text(notice)}</p>" for notice in notices)
+
+
+def _source(results: Mapping[str, Any]) -> list[str]:
+    """Where the demonstrations are from, if their file says so."""
+    source = results.get("source")
+    if not source:
+        return []
+    said = [f"Where the demonstrations are from, by their file: {source}."]
+    if str(source).startswith(_SCRIPTED):
+        said.append(_SCRIPTED_NOTE)
+    return [" ".join(said)]
 
 
 def _verdicts(verdicts: Iterable[diagnostics.Verdict]) -> str:
@@ -146,6 +169,9 @@ def _videos(shown: showcase.Showcase | None) -> str:
         return ""
     parts = []
     for video in shown.videos:
+        speed = ""
+        if video.speed != 1:
+            speed = f'<span style="flex-basis:100%">{video.speed} times as fast</span>'
         panels = "".join(
             f"<span><b>{text(panel.name)}</b>, "
             f"true return {format_number(panel.true_return)}</span>"
@@ -155,7 +181,7 @@ def _videos(shown: showcase.Showcase | None) -> str:
             f'<figure style="max-width:{380 * len(video.panels)}px">'
             f"<h3>{text(display_name(video.target))}</h3>"
             f'<video src="{text(video.file)}" controls loop muted playsinline></video>'
-            f"<figcaption>{panels}</figcaption></figure>"
+            f'<figcaption style="flex-wrap:wrap">{panels}{speed}</figcaption></figure>'
         )
     parts += [f"<p class=notice>{text(line)}</p>" for line in shown.notices]
     return f"<section><h2>Side by side</h2>{''.join(parts)}</section>"
@@ -167,7 +193,7 @@ def _times(seconds: Mapping[str, float | None]) -> str:
         return ""
     longest = max(*known.values(), 1e-9)
     rows = "".join(
-        f"<tr><th scope=row>{text(stage)}</th><td>{_duration(value)}</td>"
+        f"<tr><th scope=row>{text(stage)}</th><td>{format_duration(value)}</td>"
         f'<td class=bar><i style="width:{100 * value / longest:.1f}%"></i></td></tr>'
         for stage, value in known.items()
     )
@@ -178,11 +204,3 @@ def _versions(results: Mapping[str, Any]) -> dict[str, Any]:
     """Returns what the run noted of its code and machine, or else what this process runs on."""
     found = {**provenance(), **{k: results[k] for k in provenance() if results.get(k)}}
     return flat(found)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"

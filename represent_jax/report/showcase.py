@@ -5,7 +5,9 @@ videos/videos.json    what they show, or why there are none
 """
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -16,6 +18,7 @@ from represent_jax.data.atomic import replacing
 from represent_jax.data.trajectories import Demonstrations
 from represent_jax.envs import Environment, Episode
 from represent_jax.errors import RepresentError
+from represent_jax.physics import offscreen
 from represent_jax.report import video
 from represent_jax.report.values import display_name
 from represent_jax.runs.directory import RunDirectory, plain
@@ -23,6 +26,9 @@ from represent_jax.runs.directory import RunDirectory, plain
 _SECONDS = 10.0
 _FPS = 30.0
 _PANEL_SIZE = (320, 240)
+# The share of the way moved that frames have to show. Of a gait, five times as fast, a third is
+# left, and it jumps about; of an arm that is driven by keys, four fifths or more.
+_LEAST_SHOWN = 0.6
 
 Policy = Callable[[jax.Array], jax.Array]
 
@@ -32,7 +38,7 @@ class Panel(NamedTuple):
 
     Attributes:
         name: who moves.
-        true_return: of the whole episode, of which the video shows the beginning.
+        true_return: of the whole episode, even where the video shows its beginning alone.
     """
 
     name: str
@@ -46,11 +52,13 @@ class Video(NamedTuple):
         target: "task", "strategy_1", ...
         file: path relative to the run's folder.
         panels: from left to right.
+        speed: how many times as fast as it was everything moves.
     """
 
     target: str
     file: str
     panels: tuple[Panel, ...]
+    speed: int = 1
 
 
 class Showcase(NamedTuple):
@@ -130,8 +138,8 @@ def make(
             moving = [demonstrated[name] for name in own if name in demonstrated]
             moving.append((Panel("Learned policy", float(rewards.sum())), qpos))
             file = f"videos/{target}.mp4"
-            _render(env, [positions for _, positions in moving], run.path / file)
-            videos.append(Video(target, file, tuple(panel for panel, _ in moving)))
+            speed = _render(env, [positions for _, positions in moving], run.path / file)
+            videos.append(Video(target, file, tuple(panel for panel, _ in moving), speed))
     except RepresentError as error:
         notices.append(f"No videos: {error}.")
     shown = Showcase(tuple(videos), tuple(notices))
@@ -153,7 +161,7 @@ def read(run: RunDirectory) -> Showcase | None:
     try:
         stored = json.loads(path.read_text())
         videos = tuple(
-            Video(one["target"], one["file"], tuple(Panel(**panel) for panel in one["panels"]))
+            Video(**one | {"panels": tuple(Panel(**panel) for panel in one["panels"])})
             for one in stored["videos"]
         )
         return Showcase(videos, tuple(stored["notices"]))
@@ -178,16 +186,35 @@ def _demonstrated(
     return found, []
 
 
-def _render(env: Environment, motions: Sequence[np.ndarray], path) -> None:
-    """Renders the first seconds, in real time, at about `_FPS` frames a second."""
+def _render(env: Environment, motions: Sequence[np.ndarray], path: Path) -> int:
+    """Renders motions [T + 1, nq] in `_SECONDS`, and returns how many times as fast they are."""
     stride = max(1, round(1.0 / (env.engine.dt * _FPS)))
-    num_steps = int(_SECONDS / env.engine.dt)
+    fps = 1.0 / (env.engine.dt * stride)
+    num_frames = round(_SECONDS * fps)
+    frames = [qpos[::stride] for qpos in motions]
+    speed = _speed(frames, num_frames)
     model = env.engine.model
     video.render_beside(
         model,
-        [qpos[: num_steps + 1 : stride] for qpos in motions],
+        [qpos[::speed][: num_frames + 1] for qpos in frames],
         path,
-        fps=1.0 / (env.engine.dt * stride),
-        camera=0 if model.ncam else -1,
+        fps=fps,
+        camera=offscreen.default_camera(model),
         size=_PANEL_SIZE,
     )
+    return speed
+
+
+def _speed(frames: Sequence[np.ndarray], num_frames: int) -> int:
+    """How many times as fast the longest motion has to be to end after some frames.
+
+    It is 1, and the end is not shown, where the frames left out would hide how the first motion
+    goes. That one is a demonstrator's, if any is shown: samples of a policy may jitter.
+
+    Args:
+        frames: positions [n, nq] of each motion.
+        num_frames: the most steps from frame to frame that are shown.
+    """
+    speed = max(1, math.ceil((max(map(len, frames)) - 1) / num_frames))
+    way, shown = (np.abs(np.diff(frames[0][::n], axis=0)).sum() for n in (1, speed))
+    return speed if shown >= _LEAST_SHOWN * way else 1

@@ -8,8 +8,8 @@ from represent_jax.report.diagnostics import FAIR, GOOD, POOR
 
 
 def test_a_good_run_is_good_throughout(results, learning):
-    verdicts = diagnostics.verdicts(results, learning)
-    assert [verdict.level for verdict in verdicts] == [GOOD] * 7
+    verdicts = diagnostics.verdicts(results, learning, np.full(20, 0.2))
+    assert [verdict.level for verdict in verdicts] == [GOOD] * 9
     assert all(verdict.sentence.startswith("Yes") for verdict in verdicts)
 
 
@@ -48,6 +48,23 @@ def test_imitation_of_negative_returns(results):
 def test_noise_curve(results, changes, level):
     results["curve"][1] = results["curve"][1] | changes
     assert diagnostics.noise_curve(results).level == level
+
+
+@pytest.mark.parametrize(("last", "level"), [(1.0, GOOD), (0.91, GOOD), (0.89, FAIR), (1.5, GOOD)])
+def test_the_floor_of_a_loss_is_where_it_stops_to_fall(last, level):
+    losses = np.concatenate([np.linspace(5.0, 1.0, 12), np.ones(4), np.full(4, last)])
+    assert diagnostics.floor(losses).level == level
+    assert diagnostics.floor(losses[:4]) is None
+
+
+@pytest.mark.parametrize(
+    ("learned", "level"),
+    [((1, 2, 3), GOOD), ((1, 3, 2.8), GOOD), ((1, 3, 2), FAIR), ((3, 2, 1), POOR)],
+)
+def test_what_agents_are_for_is_their_own_reward(learned, level):
+    curve = {"learned_return": np.asarray(learned), "true_return": np.zeros(3)}
+    assert diagnostics.maximised({"task": curve}).level == level
+    assert diagnostics.maximised({"task": {"learned_return": np.ones(2)}}) is None
 
 
 @pytest.mark.parametrize(("share", "level"), [(0.85, GOOD), (0.7, FAIR), (0.5, POOR)])

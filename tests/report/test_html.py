@@ -3,11 +3,17 @@
 import html.parser
 import json
 import re
+import types
 
 import numpy as np
 import pytest
 
+import represent_jax as rj
 from represent_jax.errors import RepresentError
+from represent_jax.methods.config import Problem
+from represent_jax.methods.presets import make_config
+from represent_jax.methods.results import describe
+from represent_jax.report import html as html_page
 from represent_jax.report.html import write_report
 
 VOID = {"meta", "img"}
@@ -83,6 +89,23 @@ def test_one_strategy_alone_is_said_to_decompose_nothing(run_path, results):
     assert "nothing to decompose" not in read(write_report(run_path))[0]
     (run_path / "results.json").write_text(json.dumps(results | {"strategies": 1}))
     assert "nothing to decompose" in read(write_report(run_path))[0]
+
+
+def test_the_source_of_the_demonstrations_is_told(run_path, results):
+    assert html_page._notices(results | {"source": None}) == html_page._notices(results) == ""
+    (run_path / "results.json").write_text(json.dumps(results | {"source": "my <lab>"}))
+    text, _ = read(write_report(run_path))
+    assert "by their file: my <lab>." in text and "operators" not in text
+
+
+@pytest.mark.parametrize("env", ["franka_kitchen", "franka_kitchen_hand"])
+def test_a_kitchen_nobody_drove_is_said_to_be_one(run_path, results, env):
+    given = rj.load_demonstrations(env)
+    problem = Problem(types.SimpleNamespace(backend="mujoco"), given, given, ())
+    source = describe(make_config("smoke", env), problem)["source"]
+    (run_path / "results.json").write_text(json.dumps(results | {"source": source}))
+    text, _ = read(write_report(run_path))
+    assert source in text and "Scripted operators, not people, drove the robot" in text
 
 
 def test_text_from_the_run_is_escaped(run_path, results):
