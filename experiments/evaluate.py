@@ -4,6 +4,8 @@ python -m experiments.evaluate --run=runs/demo
 python -m experiments.evaluate --run=runs/demo --trajectories=mine.npz --noise_level=0.1
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,11 +13,11 @@ from absl import flags
 
 from experiments import launch
 from represent_jax.agents import rollout
-from represent_jax.api import load_config, load_reward
+from represent_jax.api import load_config
 from represent_jax.data.catalogue import load_test
-from represent_jax.data.trajectories import pad
+from represent_jax.data.trajectories import TrajectoryBatch, pad
 from represent_jax.envs import Episode, make_env
-from represent_jax.errors import UsageError
+from represent_jax.errors import RepresentError, UsageError
 from represent_jax.methods.registry import find_method
 from represent_jax.report import tables
 from represent_jax.report.values import display_name, format_number
@@ -43,7 +45,6 @@ _BACKEND = flags.DEFINE_string("backend", None, "Physics engine; that of the run
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     config = load_config(_RUN.value)
-    reward = load_reward(_RUN.value)
     robot = make_env(config.env, _BACKEND.value or config.backend)
     env = Episode(robot, config.horizon or robot.horizon, auto_reset=False)
     data = load_test(config.env, _TRAJECTORIES.value or config.test)
@@ -51,6 +52,13 @@ def main(argv: list[str]) -> None:
     policies = {}
     if directory.is_done(method.policies_in):
         policies = method.load_policies(config, robot, directory)
+    try:
+        rewards = method.load_rewards(config, robot, directory)
+    except RepresentError:
+        # A clone has no reward; there are its policy's episodes to look at.
+        if not policies:
+            raise
+        rewards = {}
     if data is None and not policies:
         raise UsageError(f"no trajectories of {config.env} ship: give some with --trajectories")
     batch, columns = None, ("target",)
@@ -61,34 +69,19 @@ def main(argv: list[str]) -> None:
         batch = pad(data.trajectories, max(t.length for t in data.trajectories))
         columns += ("Pearson", "Spearman")
     targets = config.target_names
+    sampled = getattr(getattr(config, "policies", None), "actions", "mode") == "sampled"
     if policies:
         columns += ("true return", "std", "learned return", "std")
     rows = []
     for target in targets:
-
-        def learned(_, *transition, target=target):
-            return reward(*transition, target=target)
-
+        reward = rewards.get(target)
         row = [display_name(target)]
         if batch is not None:
-            returns = rollout.learned_returns(batch, learned, None)
-            found = evaluation.correlate(rollout.true_returns(batch), returns)
-            row += [format_number(float(x), 3) for x in found]
+            row += _correlations(batch, reward) if reward else ["-", "-"]
         if target in policies:
-            episodes = jax.jit(
-                lambda key, policy=policies[target]: rollout.rollout(
-                    env,
-                    lambda _, obs_t, key: policy(obs_t),
-                    None,
-                    key,
-                    jnp.full(_EPISODES.value, _NOISE_LEVEL.value),
-                )
-            )(jax.random.PRNGKey(_SEED.value))
-            for values in (
-                rollout.true_returns(episodes),
-                rollout.learned_returns(episodes, learned, None),
-            ):
-                row += [format_number(float(np.mean(values))), format_number(float(np.std(values)))]
+            episodes = _episodes(env, policies[target], sampled)
+            row += _mean_and_std(rollout.true_returns(episodes))
+            row += _mean_and_std(_learned_returns(episodes, reward)) if reward else ["-", "-"]
         rows.append((*row, *["-"] * (len(columns) - len(row))))
     table = tables.Table(
         title=f"{len(data.trajectories) if data else 'No'} trajectories, "
@@ -98,6 +91,30 @@ def main(argv: list[str]) -> None:
         note="",
     )
     print(tables.to_text(table))
+
+
+def _episodes(env: Episode, policy: Callable[..., jax.Array], sampled: bool) -> TrajectoryBatch:
+    """Episodes of a policy, under the noise asked for; sampled actions differ between them."""
+
+    def act(_, obs_t, key):
+        return policy(obs_t, key) if sampled else policy(obs_t)
+
+    levels = jnp.full(_EPISODES.value, _NOISE_LEVEL.value)
+    roll_out = jax.jit(lambda key: rollout.rollout(env, act, None, key, levels))
+    return roll_out(jax.random.PRNGKey(_SEED.value))
+
+
+def _learned_returns(batch: TrajectoryBatch, reward: Callable[..., jax.Array]) -> jax.Array:
+    return rollout.learned_returns(batch, lambda _, *transition: reward(*transition), None)
+
+
+def _correlations(batch: TrajectoryBatch, reward: Callable[..., jax.Array]) -> list[str]:
+    found = evaluation.correlate(rollout.true_returns(batch), _learned_returns(batch, reward))
+    return [format_number(float(x), 3) for x in found]
+
+
+def _mean_and_std(values: jax.Array) -> list[str]:
+    return [format_number(float(np.mean(values))), format_number(float(np.std(values)))]
 
 
 if __name__ == "__main__":

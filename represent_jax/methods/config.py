@@ -3,7 +3,7 @@
 import dataclasses
 from typing import NamedTuple
 
-from represent_jax.config import require
+from represent_jax.config import later, require
 from represent_jax.data.trajectories import Demonstrations, Trajectory, without_pauses
 from represent_jax.envs import Environment, Episode, registry
 from represent_jax.errors import RepresentError, UsageError, unknown
@@ -44,7 +44,7 @@ class MethodConfig:
     env: str = "half_cheetah"
     preset: str = "quick"
     seed: int = 0
-    phase_1_seed: int | None = None
+    phase_1_seed: int | None = later(None)
     backend: str = "auto"
     num_strategies: int = 2
     grouping: str = "separate"

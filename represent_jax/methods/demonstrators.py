@@ -88,6 +88,7 @@ class DemonstratorConfig:
             self.strategy_order,
         )
         require(self.seed != self.test_seed, "test_seed", "another than seed", self.test_seed)
+        require(self.test_snapshots >= 2, "test_snapshots", "at least 2", self.test_snapshots)
 
 
 _SAC = SacConfig(initial_temperature=0.1, learning_rate=1e-3)

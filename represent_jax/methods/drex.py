@@ -99,7 +99,9 @@ def plan(
     def judge_rewards(key, directory, noisy, params):
         batch = _batch(noisy)
         learned = results.learned_returns(_rewards_of(config, params))
-        found = results.judge_rewards(problem, {"noisy_1": batch}, learned, directory)
+        found = results.judge_rewards(
+            problem, results.noisy_groups(config, noisy), learned, directory
+        )
         found[name] |= _accuracies(key, config, params, batch)
         return {"rewards": found}
 
@@ -239,6 +241,8 @@ def _objective(config, env, params, batch: TrajectoryBatch, reward_fn) -> polici
     lowest, highest = jnp.min(batch.noise_level), jnp.max(batch.noise_level)
     clean = jnp.mean(mean, where=batch.noise_level == lowest)
     noisiest = jnp.mean(mean, where=batch.noise_level == highest)
-    scale = 1.0 / jnp.maximum(clean - noisiest, 1e-6)
+    # Where episodes end early their sums may be ordered and their means not: then by their spread.
+    falls = clean - noisiest
+    scale = 1.0 / jnp.maximum(jnp.where(falls > 0.0, falls, jnp.std(mean)), 1e-6)
     objective = policies.make_objective(params, scale, env, config.policies)
     return objective._replace(center=objective.center + scale * noisiest)

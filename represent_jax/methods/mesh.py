@@ -53,7 +53,7 @@ def axis_of_leaves(axes: Any, tree: Any) -> Any:
     return jax.tree.broadcast(axes, tree, is_leaf=absent)
 
 
-def shared(mesh: Mesh, program: Callable, axes_in: tuple, axes_out: Any) -> Callable:
+def sharded(mesh: Mesh, program: Callable, axes_in: tuple, axes_out: Any) -> Callable:
     """Runs a program on each device's members.
 
     Args:

@@ -105,6 +105,12 @@ class OperatorsConfig:
             f"1 to {self.episodes}, the episodes driven",
             self.demonstrations,
         )
+        require(
+            self.test_trajectories >= 2,
+            "test_trajectories",
+            "at least 2, from deft to hopeless",
+            self.test_trajectories,
+        )
 
 
 OPERATORS = {name: OperatorsConfig(env=name) for name in ("franka_kitchen", "franka_kitchen_hand")}

@@ -183,7 +183,10 @@ def learned_returns(
 def load(
     config: MethodConfig, env: Environment, directory: RunDirectory
 ) -> dict[str, Callable[[jax.Array], jax.Array]]:
-    """The policies that a run of any method with `policies` hands on, by target."""
+    """The policies that a run of any method with `policies` hands on, by target.
+
+    They take a key beside observations, for actions that are to be sampled; see `policies.act`.
+    """
     names = config.policy_names
     key = jax.random.PRNGKey(0)
     example = jax.eval_shape(lambda key: _random_policy(key, env, config.policies), key)
@@ -196,7 +199,9 @@ def load(
 
     def policy_of(i):
         params = jax.tree.map(lambda x: x[i], stacked)
-        return lambda obs: policies.act(params, obs, env.action_size, config.policies)
+        return lambda obs, key=None: policies.act(
+            params, obs, env.action_size, config.policies, key
+        )
 
     return {name: policy_of(i) for i, name in enumerate(names)}
 

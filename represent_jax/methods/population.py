@@ -1,4 +1,4 @@
-"""Runs several members of one stage together: strategies, targets, seeds.
+"""Runs several members of one stage together: strategies or targets.
 
 A stage is written for one member. On an accelerator a population is one vmap. On a CPU host the
 small matrices of these networks do not fill two cores, so there the members run side by side,
@@ -65,7 +65,7 @@ class Population:
         init_vmap = jax.vmap(init, out_axes=axes)
         if self.mesh is None:
             return jax.jit(init_vmap)(keys, stack(self.inputs))
-        program = meshes.shared(self.mesh, init_vmap, (0, 0), meshes.axis_of_leaves(axes, state))
+        program = meshes.sharded(self.mesh, init_vmap, (0, 0), meshes.axis_of_leaves(axes, state))
         return jax.jit(program)(*meshes.place(self.mesh, (keys, stack(self.inputs)), 0))
 
     def stepper(self, step: Callable[[Any, Any], tuple[Any, Any]]) -> Callable:
@@ -94,20 +94,22 @@ class Population:
             return jax.vmap(step, in_axes=(axes, 0), out_axes=(axes, 0))(states, inputs)
 
         if self.mesh is None:
-            return jax.jit(lambda states: step_vmap(states, inputs), donate_argnums=0)
+            # Inputs are an argument of the compiled program, not a constant in it.
+            step_jit = jax.jit(step_vmap, donate_argnums=0)
+            return lambda states: step_jit(states, inputs)
         inputs = meshes.place(self.mesh, inputs, 0)
 
         @functools.partial(jax.jit, donate_argnums=0)
-        def step_shared(states, inputs):
+        def step_sharded(states, inputs):
             axes = meshes.axis_of_leaves(self._axes_of(states), states)
-            states, metrics = meshes.shared(self.mesh, step_vmap, (axes, 0), (axes, 0))(
+            states, metrics = meshes.sharded(self.mesh, step_vmap, (axes, 0), (axes, 0))(
                 states, inputs
             )
             return states, meshes.replicate(self.mesh, metrics)
 
         def step_placed(states):
             axes = meshes.axis_of_leaves(self._axes_of(states), states)
-            return step_shared(meshes.place(self.mesh, states, axes), inputs)
+            return step_sharded(meshes.place(self.mesh, states, axes), inputs)
 
         return step_placed
 

@@ -7,7 +7,15 @@ from typing import Any, NamedTuple
 import jax
 
 from represent_jax.errors import unknown
-from represent_jax.methods import cloning, drex, msrd, policy_learning, represent, ssrr
+from represent_jax.methods import (
+    cloning,
+    drex,
+    imitation,
+    msrd,
+    policy_learning,
+    represent,
+    ssrr,
+)
 from represent_jax.methods.config import MethodConfig, RepresentConfig
 from represent_jax.methods.plan import Stage
 
@@ -65,6 +73,21 @@ METHODS: dict[str, Method] = {
         load_rewards=msrd.load_rewards,
         load_policies=msrd.load_policies,
         policies_in="msrd",
+    ),
+    "noisy_airl": Method(
+        config=imitation.NoisyAirlMethodConfig,
+        plan=imitation.plan,
+        load_rewards=imitation.load_rewards,
+        load_policies=imitation.load_policies,
+        policies_in="airl",
+    ),
+    "airl": Method(
+        config=imitation.AirlMethodConfig,
+        plan=imitation.plan,
+        load_rewards=imitation.load_rewards,
+        load_policies=imitation.load_policies,
+        policies_in="airl",
+        configure=imitation.configure_airl,
     ),
     "bc": Method(
         config=cloning.BcMethodConfig,

@@ -51,7 +51,7 @@ def first_stages(
         return pipeline.run_airl(key, config, problem, directory, checkpoint_seconds)
 
     def judge_imitation(key, directory, first):
-        return results.judge_airl(key, config, problem, first)
+        return results.judge_airl(key, config.airl, problem, first, config.noise.actions)
 
     def roll_out(key, directory, first):
         return pipeline.run_noise(key, config, problem, first, directory)
@@ -59,9 +59,11 @@ def first_stages(
     def fit(key, directory, first, noisy):
         return pipeline.fit_curves(config, problem, first, noisy)
 
+    # Samples are what was judged before there was a choice.
+    judged = {"actions": "mode"} if config.noise.actions == "mode" else {}
     stages = (
         Stage("airl", imitate, (), {"airl": config.airl, "population": config.population}),
-        Stage("airl_evaluation", judge_imitation, ("airl",), reports=True),
+        Stage("airl_evaluation", judge_imitation, ("airl",), judged, reports=True),
         Stage("noise", roll_out, ("airl",), {"noise": config.noise}),
         Stage("curve", fit, ("airl", "noise"), {"curve": config.curve}),
     )
@@ -87,7 +89,7 @@ def last_stages(
     reward_fn = _reward_fn(config)
 
     def judge_rewards(key, directory, noisy, curves, rewards):
-        groups = results.noisy_groups(noisy)
+        groups = results.noisy_groups(config, noisy)
         learned = results.learned_returns(rewards_of(rewards))
         return {
             "curve": results.describe_curves(curves),

@@ -18,10 +18,11 @@ import numpy as np
 from represent_jax.agents import rollout as rollouts
 from represent_jax.data.trajectories import TrajectoryBatch, pad
 from represent_jax.envs import Episode
-from represent_jax.methods.config import MethodConfig, Problem, RepresentConfig
+from represent_jax.methods.config import MethodConfig, Problem
 from represent_jax.methods.policy_learning import Trained
 from represent_jax.runs import RunDirectory, provenance
 from represent_jax.stages import airl, curve, evaluation, noise, policies, style
+from represent_jax.stages.airl import AirlConfig
 
 # Episodes behind every return that a run reports.
 FINAL_EPISODES = 10
@@ -63,24 +64,38 @@ def describe(config: MethodConfig, problem: Problem) -> dict[str, Any]:
             }
             for name, group in zip(config.group_names, groups, strict=True)
         ],
+        "source": demonstrations.metadata.get("source"),
         "missing": [what for what, there in given.items() if not there],
         **provenance(),
     }
 
 
 def judge_airl(
-    key: jax.Array, config: RepresentConfig, problem: Problem, first: airl.AirlOutput
+    key: jax.Array,
+    config: AirlConfig,
+    problem: Problem,
+    first: airl.AirlOutput,
+    actions: str = "sampled",
 ) -> dict[str, Any]:
-    """True returns of Phase 1's policies, and how well its rewards know the test trajectories."""
+    """True returns of Phase 1's policies, and how well its rewards know the test trajectories.
+
+    Args:
+      key: PRNG key.
+      config: settings of Phase 1.
+      problem: holds the demonstrators and the test trajectories.
+      first: what Phase 1 made; leaves are `[num_strategies, ...]`.
+      actions: what is rolled out after it, "sampled" actions or the "mode" of them.
+    """
     env = Episode(problem.env.env, problem.env.horizon, auto_reset=False)
     test = pad(problem.test, problem.env.horizon) if problem.test else None
 
     def one(key, policy, reward):
         def act(params, obs_t, key):
-            return airl.act(params, obs_t, key, config.airl, env.action_size)
+            mode = actions == "mode"
+            return airl.act(params, obs_t, key, config, env.action_size, deterministic=mode)
 
         def reward_fn(params, *transition):
-            return airl.reward(params, *transition, config.airl)
+            return airl.reward(params, *transition, config)
 
         batch = rollouts.rollout(env, act, policy, key, jnp.zeros(FINAL_EPISODES))
         found = None
@@ -101,12 +116,17 @@ def judge_airl(
     return {"airl": judged}
 
 
-def noisy_groups(noisy: noise.NoisyData) -> dict[str, TrajectoryBatch]:
-    """Phase 2's rollouts by strategy, as `judge_rewards` takes them."""
+def noisy_groups(config: MethodConfig, noisy: noise.NoisyData) -> dict[str, TrajectoryBatch]:
+    """Phase 2's rollouts by group, as `judge_rewards` takes them."""
     return {
-        f"noisy_{i + 1}": jax.tree.map(lambda x, i=i: x[i], noisy.trajectories)
-        for i in range(noisy.levels.shape[0])
+        _noisy(name): jax.tree.map(lambda x, i=i: x[i], noisy.trajectories)
+        for i, name in enumerate(config.group_names)
     }
+
+
+def _noisy(group: str) -> str:
+    """ "noisy_1" for "strategy_1", "noisy_merged" for "merged"."""
+    return f"noisy_{group.removeprefix('strategy_')}"
 
 
 def learned_returns(
@@ -125,7 +145,7 @@ def learned_returns(
 def agents_episodes(
     config: policies.PoliciesConfig, env: Episode, names: Sequence[str], trained: Trained
 ) -> dict[str, Episodes]:
-    """Deterministic episodes of trained agents, by target."""
+    """Episodes of trained agents as they are handed on, by target."""
 
     # One program for all targets: compiling the physics takes longer than the episodes.
     roll_out = jax.jit(
@@ -195,8 +215,8 @@ def judge_rewards(
             **(_correlations("noisy", true, found, list(noisy)) if noisy else {}),
             **(_correlations("pooled", true, found, list(groups)) if groups else {}),
         }
-        own = name.replace("strategy_", "noisy_")
-        if "task" in judged and own != name and own in noisy:
+        own = _noisy(name)
+        if "task" in judged and own in noisy:
             share = evaluation.slope(found[own], judged["task"][own])
             results[name]["task_share"] = float(share)
         if problem.test and problem.demonstrations.has_rewards:
@@ -269,7 +289,12 @@ def judge_policies(
             "learned_return_final": (
                 float(np.mean(learned[name](batch))) if name in learned else None
             ),
-            "style_kept": None if group is None else float(shares[group]),
+            # Of a single group's every state is taken for its own.
+            "style_kept": (
+                None
+                if group is None or demonstrations.num_strategies == 1
+                else float(shares[group])
+            ),
             **{
                 quantity: float(np.mean(values))
                 for quantity, values in problem.env.unwrapped.outcomes(batch.obs).items()

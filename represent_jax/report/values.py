@@ -9,6 +9,8 @@ METHOD_NAMES = {
     "ssrr": "SSRR",
     "msrd": "MSRD",
     "drex": "D-REX",
+    "noisy_airl": "Noisy-AIRL",
+    "airl": "AIRL",
     "bc": "BC",
     "bc_rnn": "BC-RNN",
 }

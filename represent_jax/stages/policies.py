@@ -29,8 +29,8 @@ class PoliciesConfig:
     """Settings of policy training on learned rewards.
 
     Attributes:
-      env_steps: budget of each target, rounded up to whole evaluations. Those that SAC takes at
-        random before its first update, `sac.warmup_env_steps`, are not counted.
+      env_steps: budget of each target, rounded up to whole evaluations. Those that SAC takes
+        before its first update, `sac.warmup_env_steps`, are not counted.
       agent: "sac" or "ppo".
       start: "phase1" starts from Phase 1's policy, "cold" from random networks.
       keep: which policy is handed on: of those evaluated the "best" by learned return, Phase 1's
@@ -224,18 +224,24 @@ def evaluate(
 
 
 def act(
-    policy: PolicyParams, obs_t: jax.Array, action_dim: int, config: PoliciesConfig
+    policy: PolicyParams,
+    obs_t: jax.Array,
+    action_dim: int,
+    config: PoliciesConfig,
+    key: jax.Array | None = None,
 ) -> jax.Array:
-    """What a policy does where it is used, a pure function of observations, `[..., action_dim]`.
+    """What a policy does where it is used, `[..., action_dim]`.
 
-    Noise of sampled actions is drawn from the observation's own bits: as good as any other, for no
-    two observations are the same, and equal observations get equal actions.
+    Without a key it is a pure function of observations: noise of sampled actions is drawn from the
+    observation's own bits, so that equal observations get equal actions, and episodes that begin
+    alike where physics has no chance in it stay alike.
     """
     agent, settings = agent_of(config)
-    if config.actions == "mode":
-        # The key is not used.
-        key = jax.random.PRNGKey(0)
-        return agent.act(policy, obs_t, key, settings, action_dim, deterministic=True)
+    mode = config.actions == "mode"
+    if mode or key is not None:
+        # The mode draws nothing from the key.
+        key = jax.random.PRNGKey(0) if key is None else key
+        return agent.act(policy, obs_t, key, settings, action_dim, deterministic=mode)
 
     def one(obs_t):
         bits = jax.lax.bitcast_convert_type(obs_t.astype(jnp.float32), jnp.uint32)

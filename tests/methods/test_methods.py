@@ -52,7 +52,7 @@ def test_a_policy_for_some_of_the_targets(tmp_path):
         rj.load_policy(out, "strategy_1")
 
 
-@pytest.mark.parametrize("method", ["drex", "msrd", "bc", "bc_rnn"])
+@pytest.mark.parametrize("method", ["drex", "msrd", "airl", "noisy_airl", "bc", "bc_rnn"])
 def test_baselines_run_to_their_end(tmp_path, method):
     record = tmp_path / "records.jsonl"
     out = tmp_path / method
@@ -63,19 +63,28 @@ def test_baselines_run_to_their_end(tmp_path, method):
     lines = [json.loads(line) for line in record.read_text().splitlines()]
     assert {line["method"] for line in lines} == {method}
     obs, action = np.zeros((3, 17), np.float32), np.zeros((3, 6), np.float32)
-    if method in ("drex", "msrd"):
-        assert rj.load_reward(out)(obs, action, obs).shape == (3,)
-    else:
+    if method.startswith("bc"):
         with pytest.raises(RepresentError, match="no reward"):
             rj.load_reward(out)
+    else:
+        for target in results["rewards"]:
+            assert rj.load_reward(out)(obs, action, obs, target=target).shape == (3,)
     if method == "bc_rnn":
         with pytest.raises(RepresentError, match="hidden state"):
             rj.load_policy(out)
-    else:
-        target = next(iter(results["policies"]))
+        return
+    for target in results["policies"]:
         assert rj.load_policy(out, target)(obs).shape == (3, 6)
-    if method == "msrd":
+
+    if method in ("msrd", "bc"):
         command = [sys.executable, "-m", "experiments.evaluate", f"--run={out}", "--episodes=2"]
         said = subprocess.check_output([*command, "--backend=mujoco"], cwd=ROOT, text=True)
-        rows = {line[:10].strip(): line.split() for line in said.splitlines() if line.strip()}
-        assert rows["Task"][-1] == "-" and rows["Strategy 2"][-1] != "-", said
+        rows = {line.split()[0]: line.split()[-6:] for line in said.splitlines() if line.split()}
+        # Whether correlations, true and learned returns are known: MSRD has no policy of the
+        # task's, a clone no reward.
+        known = {
+            "msrd": {"Task": [True, False, False], "Strategy": [True, True, True]},
+            "bc": {"Task": [False, True, False]},
+        }
+        for name, expected in known[method].items():
+            assert ["-" not in rows[name][i : i + 2] for i in (0, 2, 4)] == expected, said
