@@ -69,7 +69,9 @@ def main(argv: list[str]) -> None:
         def act(params, obs_t, key):
             return agent.act(params, obs_t, key, config, env.action_size, deterministic=True)
 
-        batch = rollout.rollout(whole, act, agent.policy_of(state.learner), state.key, jnp.zeros(5))
+        key_eval, key = jax.random.split(state.key)
+        state = state.replace(key=key)
+        batch = rollout.rollout(whole, act, agent.policy_of(state.learner), key_eval, jnp.zeros(5))
         result = {"true_return": jnp.mean(rollout.true_returns(batch)), **metrics}
         if reward_fn is not None:
             returns = rollout.learned_returns(batch, reward_fn, None) / scale
@@ -81,7 +83,7 @@ def main(argv: list[str]) -> None:
             print(f"{_OUT.value}: done already")
             return
         start = time.monotonic()
-        init = jax.jit(lambda key: agent.init(key, env, config))
+        init = jax.jit(lambda key: agent.init(key, env, config, reward_fn=reward_fn))
         env_steps = num_steps * config.env_steps_per_step
         state = advance(
             run,

@@ -119,7 +119,7 @@ def _record(
     results = {
         "env": config.env,
         "seed": config.seed,
-        "preset": config.preset,
+        "preset": config.protocol,
         "backend": backend,
         "seconds": {"transfer": round(seconds, 1)},
         "demonstrators": (),

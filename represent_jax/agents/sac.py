@@ -114,7 +114,7 @@ class LearnerState:
       log_temperature: `[]`.
       policy_opt, q_opt, temperature_opt: optimiser states.
       obs_stats: running statistics of observations (unused without normalisation).
-      prior: pi_1, the policy to stay near; None where its weight is 0.
+      prior: pi_1, the policy to stay near; None where its weight is 0, or where it starts cold.
     """
 
     policy_params: Params

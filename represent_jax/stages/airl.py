@@ -26,6 +26,8 @@ from represent_jax.types import Metrics, Params, Transition
 
 # One environment in two is clean; the others climb to a quarter of random actions (SSRR's levels).
 TRAINING_NOISE_LEVELS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.05, 0.10, 0.15, 0.20, 0.25)
+# What `policy_average_rate` is told for.
+_AVERAGED_ENV_STEPS = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +45,8 @@ class AirlConfig:
       noisy: whether training environments have the noise levels of SSRR (Noisy-AIRL).
       reward_scale: factor on f where it rewards the generator.
       reward_clip: bound on f where it rewards the generator.
-      policy_average_rate: share of the generator that enters the average handed on, after every
-        training step; 1 hands on the last generator itself.
+      policy_average_rate: share of the generator that enters the average handed on, every 64
+        environment steps; 1 hands on the last generator itself.
       discriminator: the discriminator.
       sac, ppo: the generators.
     """
@@ -165,9 +167,15 @@ def step(
     one_step = _step_off_policy if config.agent == "sac" else _step_on_policy
     agent, learned, metrics = one_step(state, env, demonstrations, config)
     average = optax.incremental_update(
-        agent.learner.policy_params, state.average, config.policy_average_rate
+        agent.learner.policy_params, state.average, _average_rate(config)
     )
     return AirlState(agent, average, learned), metrics
+
+
+def _average_rate(config: AirlConfig) -> float:
+    """The share of a training step, which is 64 environment steps of SAC and 2,048 of PPO."""
+    env_steps = generator(config)[1].env_steps_per_step
+    return 1.0 - (1.0 - config.policy_average_rate) ** (env_steps / _AVERAGED_ENV_STEPS)
 
 
 def _step_off_policy(state, env, demonstrations, config):
@@ -205,7 +213,7 @@ def _step_on_policy(state, env, demonstrations, config):
     env_reward = jnp.mean(transitions.reward_t)
     if not config.learn_policy:
         return agent, learned, {**metrics, "env_reward": env_reward}
-    # The actions are the policy's own, so that f - log pi is worth what AIRL says.
+    # log pi is that of the drawn action, also where noise replaced it and f is of another.
     f_t = _bounded_advantage(learned.params, transitions, config)
     log_prob_t = discriminator.bounded_log_prob(rollout.log_prob_t, config.discriminator)
     reward_t = f_t - config.reward_scale * log_prob_t

@@ -3,10 +3,11 @@
 Mandlekar et al., What Matters in Learning from Offline Human Demonstrations for Robot Manipulation
 (2021), arXiv 2108.03298, at the defaults of its code, robomimic. An LSTM reads short sequences of
 demonstrations, each from an empty hidden state, and predicts the action of every step; acting, it
-forgets as often as it did in training. Three things differ from robomimic: observations are
-standardised by mean and standard deviation of the demonstrations (an option there, off); sequences
-lie whole within an episode where it is long enough, while robomimic also lets them begin near its
-end and repeats the last step; initial parameters are Flax's, not PyTorch's.
+forgets as often as it did in training. What differs from robomimic: observations are standardised
+by mean and standard deviation of the demonstrations (an option there, off); sequences lie whole
+within an episode where it is long enough, while robomimic also lets them begin near its end and
+repeats the last step; initial parameters are Flax's, not PyTorch's; no layers stand behind the LSTM
+(two of 1,024 there, `mlp_sizes` here); updates are fewer.
 """
 
 import dataclasses

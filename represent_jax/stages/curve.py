@@ -131,7 +131,7 @@ class Curve(NamedTuple):
         levels: [L] noise levels, ascending.
         scaled_returns: [L] typical return of each level, min-max scaled to [0, 1].
         fitted: [L] the curve at the levels: the targets of the regression.
-        r2: [] coefficient of determination of the sigmoid on the scaled means.
+        r2: [] coefficient of determination of the sigmoid on the scaled returns.
         status: [] int32 CurveStatus.
     """
 
@@ -149,9 +149,9 @@ class Curve(NamedTuple):
 def fit(levels: jax.Array, returns: jax.Array, config: CurveConfig) -> Curve:
     """Fits the noise-performance curve of one strategy; vmap over returns for several.
 
-    The medians of each level are min-max scaled to [0, 1] (Chen et al., 2020), so the curve does
-    not depend on the units of the learned reward. A sigmoid that does not fall or does not fit is
-    replaced by the decreasing isotonic fit of these values, which the status says.
+    The medians (or means) of each level are min-max scaled to [0, 1] (Chen et al., 2020), so the
+    curve does not depend on the units of the learned reward. A sigmoid that does not fall or does
+    not fit is replaced by the decreasing isotonic fit of these values, which the status says.
 
     Args:
         levels: [L] noise levels, ascending.

@@ -90,7 +90,7 @@ class DiaynState:
 
 
 @functools.lru_cache
-def _discriminator(obs_dim: int, config: DiaynConfig):
+def _discriminator(config: DiaynConfig):
     module = brax_networks.MLP(
         layer_sizes=(*config.discriminator_hidden_sizes, config.num_skills),
         activation=linen.relu,
@@ -111,14 +111,14 @@ def init(key: jax.Array, env: Episode, config: DiaynConfig) -> DiaynState:
     skills = jnp.arange(config.sac.num_envs) % config.num_skills
     start = jax.vmap(conditioned.reset)(jax.random.split(key_reset, skills.size), skills)
     agent = sac.init(key_sac, conditioned, config.sac, start)
-    module, optimizer = _discriminator(size, config)
+    module, optimizer = _discriminator(config)
     params = module.init(key_discriminator, _seen(jnp.zeros(size), config))
     return DiaynState(agent, params, optimizer.init(params))
 
 
 def log_skill_posterior(params: Params, obs_t: jax.Array, config: DiaynConfig) -> jax.Array:
     """Log q(z|s), `[..., num_skills]`, of observations without the skill, `[..., obs_dim]`."""
-    module, _ = _discriminator(obs_t.shape[-1], config)
+    module, _ = _discriminator(config)
     return jax.nn.log_softmax(module.apply(params, _seen(obs_t, config)))
 
 
@@ -155,7 +155,7 @@ def step(state: DiaynState, env: Episode, config: DiaynConfig) -> tuple[DiaynSta
         return -jnp.mean(jnp.sum(log_posterior * skill, axis=-1)), log_posterior
 
     (loss, log_posterior), grads = jax.value_and_grad(loss_fn, has_aux=True)(state.discriminator)
-    _, optimizer = _discriminator(env.observation_size, config)
+    _, optimizer = _discriminator(config)
     updates, discriminator_opt = optimizer.update(grads, state.discriminator_opt)
     discriminator = optax.apply_updates(state.discriminator, updates)
 

@@ -5,8 +5,8 @@ AIRL (https://arxiv.org/abs/1710.11248) tells demonstrations from the policy's o
   logits = f(s, a, s') - log pi(a|s),   f = g + gamma h(s') - h(s),
 
 where g becomes the reward and h absorbs shaping. SSRR (Chen et al., 2020) trains it on rollouts
-under action noise of known level eta, whose rows are weighted by how much less likely the clean
-policy is to act so: w = pi(a|s) / (eta u + (1 - eta) pi(a|s)), with u the uniform density. Here log
+under action noise of known level eta, whose rows are weighted by how much likelier the clean policy
+is to act so: w = pi(a|s) / (eta u + (1 - eta) pi(a|s)), with u the uniform density. Here log
 pi is bounded, in w as in the logits, so that w stays near 1 whatever the action.
 """
 

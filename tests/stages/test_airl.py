@@ -65,9 +65,11 @@ def test_states_alone_are_imitated_from_a_random_policy(problem):
     assert all(bool(jnp.isfinite(value)) for value in metrics.values())
 
 
-def test_the_policy_handed_on_is_the_average(problem):
-    rate = 0.25
-    config = dataclasses.replace(SMOKE.airl, policy_average_rate=rate)
+@pytest.mark.parametrize("agent", ["sac", "ppo"])
+def test_the_policy_handed_on_is_the_average(problem, agent):
+    config = dataclasses.replace(SMOKE.airl, agent=agent, policy_average_rate=0.25)
+    # A step of PPO is of more environment steps than one of SAC, and enters by as much more.
+    rate = 1.0 - 0.75 ** (airl.generator(config)[1].env_steps_per_step / 64)
     demonstrations = transitions_of(problem.demonstrations)[0]
 
     @jax.jit
