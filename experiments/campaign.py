@@ -84,10 +84,11 @@ def main(argv: list[str]) -> None:
         what = "left" if _ENGINE.value == "local" else "of work left"
         said += "" if left is None else f"; {format_duration(left)} {what}"
         print(f"{number} {node.name}: {state} {said}", flush=True)
-        record(graph, (entry for entry in every if node in entry.reports.values()), records)
+        record(graph, (entry for entry in every if node.hash in _hashes(entry)), records)
 
     with _engine(every) as engine:
         graph.run(report, engine)
+    record(graph, every, records)
     bad = [node for node in graph.nodes if graph.states[node.hash] in (FAILED, BLOCKED)]
     print(f"{len(graph.nodes) - len(bad)} of {len(graph.nodes)} stages done; records: {records}")
     _print_time(graph)
@@ -96,6 +97,11 @@ def main(argv: list[str]) -> None:
             f"{node.name} ({graph.errors[node.hash]})" for node in bad if node.hash in graph.errors
         ]
         raise RepresentError(f"{len(bad)} stages are not done; failed: {'; '.join(failed)}")
+
+
+def _hashes(entry: Entry) -> set[str]:
+    """Of an entry's reports; nodes that several runs share have names of their own."""
+    return {node.hash for node in entry.reports.values()}
 
 
 def _print_time(graph: Graph) -> None:

@@ -1,7 +1,8 @@
 """Finds out how many strategies a pool of demonstrations shows, and which trajectory shows which.
 
 python -m experiments.infer_strategies --demonstrations=pool.npz --out=labelled.npz
-python -m experiments.represent --env=half_cheetah --demonstrations=labelled.npz
+python -m experiments.represent --env=half_cheetah --demonstrations=labelled.npz \\
+    --override num_strategies=3
 
 Labels that the pool has already are not looked at; --compare says how well they were recovered, and
 with --sizes how well they are in smaller pools, drawn at random from the pool's strategies:

@@ -2,8 +2,9 @@
 
 python -m experiments.make_demonstrations --env=half_cheetah --out=represent_jax/data/shipped
 python -m experiments.make_demonstrations --env=half_cheetah_8 --out=represent_jax/data/shipped
-python -m experiments.make_demonstrations --env=franka_kitchen --override push.fast_share=0.3
-python -m experiments.make_demonstrations --env=my_robots:Swimmer --out=data \
+python -m experiments.make_demonstrations --env=franka_kitchen --out=data \\
+    --override push.fast_share=0.3
+python -m experiments.make_demonstrations --env=my_robots:Swimmer --out=data \\
     --override diayn.num_skills=2 --override target_returns=20,30
 """
 

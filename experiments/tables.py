@@ -1,6 +1,6 @@
 """Prints the paper's tables from records, beside the paper's own figures.
 
-python -m experiments.tables --table=1
+python -m experiments.tables --table=1 --preset=quick
 python -m experiments.tables --table=2 --preset=quick --format=latex
 python -m experiments.tables --update=README.md
 """

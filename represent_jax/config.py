@@ -120,8 +120,8 @@ def identity(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def config_hash(config: Any) -> str:
-    """Returns twelve hexadecimal digits, equal for equal configurations (or dictionaries)."""
-    values = dict(config) if isinstance(config, Mapping) else to_dict(config)
+    """Returns twelve hexadecimal digits, equal for equal configurations; see `identity`."""
+    values = identity(config) if isinstance(config, Mapping) else _identity(config)
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 

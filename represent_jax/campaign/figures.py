@@ -33,7 +33,7 @@ def _draw(ax: Axes, target: str, methods: Mapping[str, Sequence[Path]]) -> None:
     for colour, (method, seeds) in zip(_COLOURS, methods.items(), strict=False):
         steps = seeds[0][0]
         returns = np.stack([values for _, values in seeds])
-        mean, std = returns.mean(axis=0), returns.std(axis=0)
+        mean, std = returns.mean(axis=0), returns.std(axis=0, ddof=min(1, len(returns) - 1))
         label = f"{VARIANT_NAMES[method]} ({len(seeds)} seed{'s' * (len(seeds) > 1)})"
         ax.plot(steps, mean, color=colour, lw=1.6, label=label)
         ax.fill_between(steps, mean - std, mean + std, color=colour, alpha=0.18, lw=0)

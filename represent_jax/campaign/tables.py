@@ -20,9 +20,7 @@ DOMAIN_NAMES = {
 }
 VARIANT_NAMES = {
     **METHOD_NAMES,
-    "noisy_airl": "Noisy-AIRL",
     "phase_1": "Phase 1",
-    "airl": "AIRL",
     "demonstrators": "Demonstrators",
     "no_reg": "without L_reg",
     "no_bcd": "without L_BCD",
@@ -66,15 +64,16 @@ class Select:
     def __init__(self, records: Iterable[Mapping[str, Any]], preset: str):
         """Sorts the records."""
         self.preset = preset
-        self._values: dict[tuple[str, str, str, str], dict[int, float]] = {}
+        self._values: dict[tuple[str, str, str, str], dict[int, float | None]] = {}
         for record in records:
-            if record["preset"] == preset and record["value"] is not None:
+            if record["preset"] == preset:
                 where = tuple(record[n] for n in ("domain", "target", "method", "quantity"))
                 self._values.setdefault(where, {})[record["seed"]] = record["value"]
 
     def values(self, domain: str, target: str, method: str, quantity: str) -> dict[int, float]:
-        """Returns the value of every seed."""
-        return self._values.get((domain, target, method, quantity), {})
+        """Returns the value of every seed that has one."""
+        held = self._values.get((domain, target, method, quantity), {})
+        return {seed: value for seed, value in held.items() if value is not None}
 
     def cell(
         self,
@@ -226,9 +225,13 @@ def make(name: str, records: Iterable[Mapping[str, Any]], preset: str) -> tuple[
     if name not in TABLES:
         raise unknown("table", name, TABLES)
     title, cells_of = TABLES[name]
+    records = list(records)
     cells = [cell for cell in cells_of(Select(records, preset)) if cell.found is not None]
     if not cells:
-        raise RepresentError(f"table {name}: no record of preset {preset!r} belongs to it")
+        held = ", ".join(dict.fromkeys(record["preset"] for record in records)) or "none"
+        raise RepresentError(
+            f"table {name}: no record of preset {preset!r} belongs to it; records are of: {held}"
+        )
     return title, cells
 
 
@@ -269,12 +272,17 @@ def to_table(title: str, cells: Sequence[Cell]) -> Table:
 def to_grids(title: str, cells: Sequence[Cell]) -> list[Table]:
     """The cells at a glance: a table for each quantity, a column for each method.
 
-    Demonstrators have no quantity but their return, and stand in the first column of every table.
+    Demonstrators have no quantity but their return, and stand in the first column of tables of it.
     """
     shown = [cell for cell in cells if cell.method == "demonstrators"]
     measured = [cell for cell in cells if cell.method != "demonstrators"]
     return [
-        _to_grid(title, quantity, shown, [cell for cell in measured if cell.quantity == quantity])
+        _to_grid(
+            title,
+            quantity,
+            shown if quantity in _RETURNS else [],
+            [cell for cell in measured if cell.quantity == quantity],
+        )
         for quantity in dict.fromkeys(cell.quantity for cell in measured)
     ]
 
@@ -295,16 +303,18 @@ def _to_grid(
         if cell.found.num < most_seeds and cell.method != "demonstrators":
             text += f" [{cell.found.num}]"
         shown.setdefault(_row_name(cell), {})[cell.method] = text
-    counted = f"{most_seeds} seed{'s' * (most_seeds > 1)}"
+    note = f"Mean +- standard deviation over {most_seeds} seeds" if most_seeds > 1 else "One seed"
     if any(cell.found.num < most_seeds for cell in measured):
-        counted += ", or as many as square brackets say"
+        note += ", or as many as square brackets say"
+    if any(cell.paper for cell in cells):
+        note += "; in round brackets the paper's"
     return Table(
         title=f"{title}: {_QUANTITY_NAMES[quantity]}",
         columns=("", *(VARIANT_NAMES[method] for method in methods)),
         rows=tuple(
             (name, *(row.get(method, "-") for method in methods)) for name, row in shown.items()
         ),
-        note=f"Mean +- standard deviation over {counted}; in round brackets the paper's.",
+        note=f"{note}.",
     )
 
 

@@ -93,7 +93,7 @@ def test_grids_have_a_table_a_quantity_and_a_column_a_method():
     assert highest.rows == (("Hopper, task", "1,010 +- 10 (1,692)", "7 (1) [1]"),)
     assert kept.columns == ("", "Demonstrators", "REPRESENT")
     assert kept.rows == (("Hopper, strategy 1", "4 (1,198)", "5"),)
-    assert "3 seeds, or" in highest.note and "over 1 seed;" in kept.note
+    assert "3 seeds, or" in highest.note and kept.note == "One seed; in round brackets the paper's."
 
 
 def test_grids_say_where_seeds_are_missing():
