@@ -199,9 +199,10 @@ def _draw_scatter(
         elif group == "test":
             style = dict(color=TEST, s=22, label="unseen test", linewidths=0.5)
         else:
-            index = int(group.rpartition("_")[2])
-            name = f"noisy strategy {index}"
-            style = dict(color=colour(f"strategy_{index}"), s=22, label=name, linewidths=0.5)
+            of = group.rpartition("_")[2]
+            own = f"strategy_{of}" if of.isdigit() else "task"
+            label = f"noisy {own.replace('_', ' ')}" if of.isdigit() else "noisy"
+            style = dict(color=colour(own), s=22, label=label, linewidths=0.5)
         handles[group] = ax.scatter(true, learned, alpha=0.85, edgecolors="white", **style)
     pooled = pearson(*(np.concatenate([groups[g][i] for g in order]) for i in (0, 1)))
     title = f"{display_name(target)}  r = {format_correlation(pooled)}"
