@@ -27,7 +27,9 @@ _ENGINES = ("local", "ray")
 _TABLES = flags.DEFINE_list("tables", ["1", "2", "3", "5"], f"Of {', '.join(TABLES)}.")
 _DOMAINS = flags.DEFINE_list("domains", list(DOMAINS), "Environments.")
 _VARIANTS = flags.DEFINE_list("variants", [], "Of a table's methods and ablations; all if empty.")
-_SEEDS = flags.DEFINE_integer("seeds", 5, "Number of seeds.", lower_bound=1)
+_SEEDS = flags.DEFINE_integer(
+    "seeds", None, "Number of seeds; 5, and 1 with preset smoke, if not given.", lower_bound=1
+)
 _SEED = flags.DEFINE_integer("seed", 0, "First of the seeds.", lower_bound=0)
 _PRESET = flags.DEFINE_string("preset", "paper", "Settings to begin with: smoke, quick or paper.")
 _OUT = flags.DEFINE_string("out", "runs/campaign", "Folder of the campaign.")
@@ -47,6 +49,7 @@ _GPUS = flags.DEFINE_float("stage_gpus", 0.0, "What Ray sets aside for a stage."
 
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
+    launch.compile_quickly(_PRESET.value)
     if _ENGINE.value not in _ENGINES:
         raise unknown("engine", _ENGINE.value, _ENGINES)
     if _WANDB.value and _ENGINE.value != "local":
@@ -57,7 +60,8 @@ def main(argv: list[str]) -> None:
             ("address", "shared_folder", "retries", "stage_cpus", "stage_gpus"),
         )
     overrides = launch.overrides(_OVERRIDE.value)
-    seeds = range(_SEED.value, _SEED.value + _SEEDS.value)
+    num_seeds = _SEEDS.value or (1 if _PRESET.value == "smoke" else 5)
+    seeds = range(_SEED.value, _SEED.value + num_seeds)
     every = entries(_TABLES.value, _DOMAINS.value, seeds, _PRESET.value, overrides, _VARIANTS.value)
     wanted = (node for entry in every for node in entry.reports.values())
     graph = Graph(wanted, _OUT.value, _track if _WANDB.value else None)

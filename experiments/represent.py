@@ -59,6 +59,7 @@ _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Show settings and stages, and ru
 
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
+    launch.compile_quickly(_PRESET.value)
     for seed in range(_SEED.value, _SEED.value + _NUM_SEEDS.value):
         config = dataclasses.replace(
             make_config(_PRESET.value, _ENV.value, _METHOD.value),

@@ -1,5 +1,7 @@
 """What launchers refuse before anything runs."""
 
+import os
+
 import pytest
 from absl import flags
 from absl.testing import flagsaver
@@ -16,6 +18,17 @@ def test_settings_are_passed_on():
 def test_what_has_a_flag_is_no_override(override):
     with pytest.raises(UsageError, match=rf"--override {override}: expected a flag for"):
         launch.overrides(["horizon=5", override])
+
+
+def test_only_smoke_is_compiled_quickly_and_only_where_nobody_says_how(monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    launch.compile_quickly("quick")
+    assert "XLA_FLAGS" not in os.environ
+    launch.compile_quickly("smoke")
+    assert "--xla_backend_optimization_level=0" in os.environ["XLA_FLAGS"]
+    monkeypatch.setenv("XLA_FLAGS", "--xla_dump_to=/dump")
+    launch.compile_quickly("smoke")
+    assert os.environ["XLA_FLAGS"] == "--xla_dump_to=/dump"
 
 
 def test_a_launcher_that_runs_alone_refuses_other_processes(capsys):
