@@ -16,4 +16,5 @@ def test_mean_and_spread_over_seeds_are_drawn():
     drawn = {line.get_label(): line.get_ydata() for line in axes.get_lines()}
     np.testing.assert_allclose(drawn["REPRESENT (2 seeds)"], [1.0, 2.0, 5.0])
     band = axes.collections[0].get_paths()[0].vertices[:, 1]
-    assert band.min() == 0.0 and band.max() == 6.0
+    # The deviation of two seeds that differ by 2, as the tables have it.
+    np.testing.assert_allclose([band.min(), band.max()], [1.0 - 2**0.5, 5.0 + 2**0.5])
