@@ -74,6 +74,11 @@ def main(argv: list[str]) -> None:
         return
     record(graph, every, records)
     started: dict[str, float] = {}
+    # Nodes that several runs share have names of their own, and one hash.
+    needing: dict[str, list[Entry]] = {}
+    for entry in every:
+        for node in entry.reports.values():
+            needing.setdefault(node.hash, []).append(entry)
 
     def report(graph: Graph, node: Node, state: str) -> None:
         number = f"[{len(graph.nodes) - len(graph.left)}/{len(graph.nodes)}]"
@@ -88,11 +93,10 @@ def main(argv: list[str]) -> None:
         what = "left" if _ENGINE.value == "local" else "of work left"
         said += "" if left is None else f"; {format_duration(left)} {what}"
         print(f"{number} {node.name}: {state} {said}", flush=True)
-        record(graph, (entry for entry in every if node.hash in _hashes(entry)), records)
+        record(graph, needing.get(node.hash, ()), records)
 
     with _engine(every) as engine:
         graph.run(report, engine)
-    record(graph, every, records)
     bad = [node for node in graph.nodes if graph.states[node.hash] in (FAILED, BLOCKED)]
     print(f"{len(graph.nodes) - len(bad)} of {len(graph.nodes)} stages done; records: {records}")
     _print_time(graph)
@@ -101,11 +105,6 @@ def main(argv: list[str]) -> None:
             f"{node.name} ({graph.errors[node.hash]})" for node in bad if node.hash in graph.errors
         ]
         raise RepresentError(f"{len(bad)} stages are not done; failed: {'; '.join(failed)}")
-
-
-def _hashes(entry: Entry) -> set[str]:
-    """Of an entry's reports; nodes that several runs share have names of their own."""
-    return {node.hash for node in entry.reports.values()}
 
 
 def _print_time(graph: Graph) -> None:

@@ -4,14 +4,12 @@ Every strategy has the reward g of its discriminator, and the generator that was
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from represent_jax.agents import rollout as rollouts
 from represent_jax.config import require
 from represent_jax.envs import Environment, Episode
 from represent_jax.methods import pipeline, results
@@ -83,12 +81,7 @@ def plan(
         def policy(params, obs_t, key):
             return airl.act(params, obs_t, key, config.airl, env.action_size, deterministic=True)
 
-        levels = jnp.zeros(results.FINAL_EPISODES)
-        roll_out = jax.jit(lambda params, key: rollouts.rollout(env, policy, params, key, levels))
-        episodes = {
-            name: functools.partial(roll_out, _member(output.policy, i))
-            for i, name in enumerate(config.group_names)
-        }
+        episodes = results.generators_episodes(env, config.group_names, output.policy, policy)
         learned = results.learned_returns(_rewards_of(config, output))
         return results.judge_policies(key, config, problem, episodes, learned, (), directory)
 

@@ -5,13 +5,11 @@ to REPRESENT, SSRR and D-REX only.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
-from represent_jax.agents import rollout as rollouts
 from represent_jax.config import require
 from represent_jax.envs import Environment, Episode
 from represent_jax.methods import pipeline, results
@@ -63,14 +61,7 @@ def plan(
         def policy(params, obs_t, key):
             return msrd.act(params, obs_t, key, config.msrd, env.action_size, deterministic=True)
 
-        levels = jnp.zeros(results.FINAL_EPISODES)
-        roll_out = jax.jit(lambda params, key: rollouts.rollout(env, policy, params, key, levels))
-
-        def episodes_of(strategy):
-            params = jax.tree.map(lambda x: x[strategy], output.policies)
-            return functools.partial(roll_out, params)
-
-        episodes = {name: episodes_of(i) for i, name in enumerate(config.group_names)}
+        episodes = results.generators_episodes(env, config.group_names, output.policies, policy)
         learned = results.learned_returns(_rewards_of(config, output))
         return results.judge_policies(key, config, problem, episodes, learned, (), directory)
 

@@ -146,16 +146,17 @@ def nodes(
     judged = whole | {"test": _digest(problem.test)}
     made: dict[str, Node] = {}
     for stage in stages:
+        seed = seed_of(config, stage)
         made[stage.name] = Node(
             kind=f"{config.env} {stage.name}",
             name=f"{name} {stage.name}",
             settings={
-                "seed": seed_of(config, stage),
+                "seed": seed,
                 **(judged if stage.reports else whole if stage.sees_pauses else common),
                 **configs.identity(stage.settings),
             },
             inputs=tuple(made[before] for before in stage.inputs),
-            run=functools.partial(run_stage, seed_of(config, stage), stage),
+            run=functools.partial(run_stage, seed, stage),
         )
     return made
 

@@ -154,6 +154,25 @@ def agents_episodes(
     return {name: functools.partial(roll_out, trained.policy(i)) for i, name in enumerate(names)}
 
 
+def generators_episodes(
+    env: Episode, names: Sequence[str], stacked: Any, act: Callable[..., jax.Array]
+) -> dict[str, Episodes]:
+    """Episodes of generators that were trained side by side, by strategy.
+
+    Args:
+      env: whole episodes.
+      names: of the strategies.
+      stacked: parameters, `[num_strategies, ...]`.
+      act: `act(params, obs_t, key)`.
+    """
+    levels = jnp.zeros(FINAL_EPISODES)
+    roll_out = jax.jit(lambda params, key: rollouts.rollout(env, act, params, key, levels))
+    return {
+        name: functools.partial(roll_out, jax.tree.map(lambda x, i=i: x[i], stacked))
+        for i, name in enumerate(names)
+    }
+
+
 def describe_curves(curves: curve.Curve) -> list[dict[str, Any]]:
     """The noise-performance curve of every strategy, for the report."""
     num_strategies = curves.r2.shape[0]
