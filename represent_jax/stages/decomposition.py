@@ -168,11 +168,9 @@ def _rows_of(batch: TrajectoryBatch, config: RegressionConfig) -> jax.Array:
 
 def _task_range(rewards: Rewards, rows: jax.Array, config: RegressionConfig) -> TaskRange:
     """Where demonstrations, `[num_strategies, rows, input_dim]`, left what R^0 sees."""
-    rows = rows.reshape(-1, rows.shape[-1])
-    seen = rows if rewards.bounds is None else jnp.clip(rows, *rewards.bounds)
-    earned = head_reward(rewards.task, task_inputs_of(seen, config), config)
+    rows = task_inputs_of(rows.reshape(-1, rows.shape[-1]), config)
+    earned = head_reward(rewards.task, rows, config)
     most = jnp.nanmax(earned) - jnp.nanmin(earned)
-    rows = task_inputs_of(rows, config)
     low, high = jnp.nanmin(rows, axis=0), jnp.nanmax(rows, axis=0)
     width = jnp.max(high - low)
     # What no demonstration changes says nothing of where the task ends.
@@ -221,14 +219,15 @@ def view_reward(
 def _task_reward(
     view: View, inputs: jax.Array, seen: jax.Array, config: RegressionConfig
 ) -> jax.Array:
-    """R^0 of inputs of which this much is seen; it falls with their distance from its range."""
-    inputs, seen = task_inputs_of(inputs, config), task_inputs_of(seen, config)
+    """R^0 of inputs of which this much is seen, or of all within its range, where it has one."""
     if view.task_range is None:
-        return head_reward(view.task, seen, config)
+        return head_reward(view.task, task_inputs_of(seen, config), config)
     low, high, slope, most = view.task_range
-    distance = jnp.linalg.norm(inputs - jnp.clip(inputs, low, high), axis=-1)
-    at_edge = head_reward(view.task, jnp.clip(seen, low, high), config)
-    return at_edge - jnp.minimum(slope * distance, most)
+    # Demonstrations may go where noisy rollouts seldom do: to the end of the task.
+    inputs = task_inputs_of(inputs, config)
+    within = jnp.clip(inputs, low, high)
+    distance = jnp.linalg.norm(inputs - within, axis=-1)
+    return head_reward(view.task, within, config) - jnp.minimum(slope * distance, most)
 
 
 def reward(

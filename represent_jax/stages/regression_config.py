@@ -48,7 +48,8 @@ class RegressionConfig:
         going on where nobody has been. Not bounded if none.
       within_demonstrations: whether rewards see nothing beyond what was demonstrated, R^0 by all,
         R~^i by strategy i, and R^0 falls there as steeply as it rises within. More of the task was
-        better in all that was rolled out; only demonstrations tell where to stop.
+        better in all that was rolled out; only demonstrations tell where to stop. R^0 sees all of
+        what was demonstrated, whatever `input_quantile` says.
       learn_units: whether each strategy's curve has a unit of its own, learned with the rewards.
         Scaled to [0, 1] by themselves, curves say that all strategies are equally good without
         noise; R^0, which sees them all, then has to call the better one's rollouts too bad.

@@ -113,6 +113,20 @@ def test_the_task_reward_falls_beyond_what_was_demonstrated(quantile):
     )
 
 
+def test_the_task_reward_is_as_fitted_where_demonstrations_went_farther_than_noisy_rollouts():
+    config = dataclasses.replace(CONFIG, within_demonstrations=True, input_quantile=1.0)
+    random = np.random.default_rng(0)
+    both = [batches.make(random.uniform(-far, far, size=(2, 21, 3))) for far in (0.5, 1.0)]
+    noisy, demonstrations = (jax.tree.map(lambda x: x[None], one) for one in both)
+    rewards = decomposition.bound(draw(3, 1, config), noisy, demonstrations, config)
+    fitted = rewards._replace(bounds=None, task_range=None)
+    states = demonstrations.obs[0, :, 1:]
+    np.testing.assert_array_equal(
+        decomposition.reward(rewards, None, None, states, config),
+        decomposition.reward(fitted, None, None, states, config),
+    )
+
+
 def test_the_task_reward_is_finite_where_demonstrations_change_nothing_that_it_sees():
     config = dataclasses.replace(CONFIG, task_entries=(1,), within_demonstrations=True)
     obs = np.random.default_rng(0).normal(size=(2, 21, 2))
