@@ -19,6 +19,7 @@ from represent_jax.campaign.entries import Entry, entries, record
 from represent_jax.campaign.variants import DOMAINS, TABLES
 from represent_jax.errors import RepresentError, UsageError, unknown
 from represent_jax.report.values import format_duration
+from represent_jax.runs import provenance
 from represent_jax.runs.graph import BLOCKED, FAILED, Engine, Graph, InTurn, Node
 from represent_jax.runs.tracking import WandbTracker
 
@@ -72,6 +73,7 @@ def main(argv: list[str]) -> None:
             print(f"{'done' if graph.is_done(node) else 'left':5} {node.hash} {node.name}")
         _print_time(graph)
         return
+    provenance()  # Of the code that is loaded now: a checkout may change while stages run.
     record(graph, every, records)
     started: dict[str, float] = {}
     # Nodes that several runs share have names of their own, and one hash.

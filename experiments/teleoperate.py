@@ -19,13 +19,17 @@ _OUT = flags.DEFINE_string(
     "out", None, "File of demonstrations to record to; demonstrations/<env>.npz if not given."
 )
 _HOST = flags.DEFINE_string("host", "localhost", "Address to listen on.")
-_PORT = flags.DEFINE_integer("port", 8080, "Port to listen on; 0 picks a free one.")
+_PORT = flags.DEFINE_integer(
+    "port", 8080, "Port to listen on; 0 picks a free one.", lower_bound=0, upper_bound=65_535
+)
 _HORIZON = flags.DEFINE_integer("horizon", None, "Steps of an episode; the environment's if empty.")
-_SEED = flags.DEFINE_integer("seed", None, "Seed of initial states; new ones every time if empty.")
+_SEED = flags.DEFINE_integer(
+    "seed", None, "Seed of initial states; new ones every time if empty.", lower_bound=0
+)
 _RUN = flags.DEFINE_string("run", None, "Run folder, one of whose policies to watch.")
 _TARGET = flags.DEFINE_string("target", "task", "Whose policy of --run: task, strategy_1, ...")
 _CAMERA = flags.DEFINE_string(
-    "camera", None, "Name of the first view; one that follows the robot if there is."
+    "camera", None, "Name of the first view, or free; one that follows the robot if there is."
 )
 _WIDTH = flags.DEFINE_integer("width", 800, "Width of pictures in pixels.", lower_bound=64)
 _HEIGHT = flags.DEFINE_integer("height", 600, "Height of pictures in pixels.", lower_bound=64)
@@ -39,7 +43,13 @@ def main(argv: list[str]) -> None:
 
     if (_ENV.value is None) == (_RUN.value is None):
         raise UsageError("expected either --env, to drive, or --run, to watch a policy")
+    if _RUN.value:
+        launch.refuse_beside("with --run, which records nothing", ("out",))
+    else:
+        launch.refuse_beside("without --run", ("target",))
     name = _ENV.value or load_config(_RUN.value).env
+    if name.startswith("playground:"):
+        raise UsageError(f"only tasks on this package's engines can be shown, not {name}")
     policy = load_policy(_RUN.value, _TARGET.value) if _RUN.value else None
     env = make_env(name, backend="mujoco")
     path = _OUT.value or f"demonstrations/{name}.npz"
@@ -49,7 +59,9 @@ def main(argv: list[str]) -> None:
     painter = Painter(model, (_WIDTH.value, _HEIGHT.value), camera)
 
     def announce(address: str) -> None:
-        print(f"Drive at {address} (Ctrl-C ends); episodes go to {path}", flush=True)
+        does = "Watch" if policy else "Drive"
+        where = "nothing is recorded" if policy else f"episodes go to {path}"
+        print(f"{does} at {address} (Ctrl-C ends); {where}", flush=True)
         if _HOST.value not in server.LOOPBACK:
             print("Whoever can reach this address can drive and record.", flush=True)
 

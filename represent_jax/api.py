@@ -10,12 +10,19 @@ import jax.numpy as jnp
 from represent_jax import config as configs
 from represent_jax.data.trajectories import Demonstrations
 from represent_jax.envs import make_env
-from represent_jax.errors import unknown
+from represent_jax.errors import UsageError, unknown
 from represent_jax.methods.config import MethodConfig, make_problem
 from represent_jax.methods.plan import execute
 from represent_jax.methods.registry import find_method
 from represent_jax.runs import RunDirectory, load_config_json, open_run
 from represent_jax.stages import strategies
+
+# What a folder's settings begin with where it holds no run of a method.
+_OTHER_FOLDERS = {
+    "kind": "a stage of a campaign; experiments.represent with the same preset, seed and settings "
+    "makes the same run in a folder of its own",
+    "run": "a policy of experiments.train_policy",
+}
 
 
 def learn(
@@ -53,10 +60,16 @@ def load_config(run_dir: str | os.PathLike) -> MethodConfig:
     """Loads the settings a run was made with.
 
     Raises:
-      RepresentError: not a run directory, or one of an older format.
+      UsageError: not the folder of a method's run, or one of an older format.
     """
     stored = load_config_json(run_dir)
-    return configs.from_dict(find_method(stored.get("method", "represent")).config, stored)
+    if "method" not in stored:
+        what = _OTHER_FOLDERS.get(next(iter(stored), ""), "something else")
+        raise UsageError(
+            f"{run_dir}: expected a run of a method, of experiments.represent or rj.learn, found "
+            f"{what}"
+        )
+    return configs.restore(find_method(stored["method"]).config, stored)
 
 
 def infer_strategies(
@@ -140,9 +153,7 @@ def load_reward_for(
     return rewards[target]
 
 
-def load_policy(
-    run_dir: str | os.PathLike, target: str = "task"
-) -> Callable[[jax.Array], jax.Array]:
+def load_policy(run_dir: str | os.PathLike, target: str = "task") -> Callable[..., jax.Array]:
     """Loads one of a run's policies.
 
     Args:
@@ -150,8 +161,9 @@ def load_policy(
       target: "task", or "strategy_1" and so on.
 
     Returns:
-      `policy(obs) -> action`, a pure function of observations `[..., obs_dim]`. Where policies are
-      to sample (`policies.actions`), the noise is drawn from the observation's own bits.
+      `policy(obs, key=None) -> action`, a pure function of observations `[..., obs_dim]`. Where
+      policies are to sample (`policies.actions`, in the kitchens), the noise is drawn from the key,
+      and without one from the observation's own bits: then episodes that start alike go on alike.
 
     Raises:
       RepresentError: the run has not trained its policies, or they carry a hidden state.
@@ -164,4 +176,4 @@ def load_policy(
     policies = find_method(config.method).load_policies(config, env, RunDirectory(run_dir))
     if target not in policies:
         raise unknown("policy", target, policies)
-    return lambda obs: policies[target](jnp.asarray(obs))
+    return lambda obs, key=None: policies[target](jnp.asarray(obs), key)

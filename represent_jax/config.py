@@ -65,6 +65,19 @@ def from_dict(cls: type[C], values: Mapping[str, Any]) -> C:
     return _build(cls, values, prefix="")
 
 
+def restore(cls: type[C], values: Mapping[str, Any]) -> C:
+    """Builds a configuration that was kept: what came later is at what was done before it.
+
+    Args:
+        cls: the dataclass to build.
+        values: what `to_dict` returned, in this version or in one before.
+
+    Raises:
+        UsageError: as `from_dict`.
+    """
+    return from_dict(cls, _with_before(cls, values))
+
+
 def apply_overrides(config: C, overrides: Sequence[str]) -> C:
     """Returns the configuration with `dotted.key=value` settings applied, all of them at once.
 
@@ -159,6 +172,19 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (tuple, list)):
         return [_plain(item) for item in value]
     return value
+
+
+def _with_before(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Fills in fields made by `later` that the values do not have yet."""
+    hints, filled = typing.get_type_hints(cls), dict(values)
+    for field in dataclasses.fields(cls):
+        inner, _ = _optional(hints[field.name])
+        held = values.get(field.name)
+        if field.name not in values and "before" in field.metadata:
+            filled[field.name] = _plain(field.metadata["before"])
+        elif dataclasses.is_dataclass(inner) and isinstance(held, Mapping):
+            filled[field.name] = _with_before(inner, held)
+    return filled
 
 
 def _optional(hint: Any) -> tuple[Any, bool]:

@@ -153,6 +153,21 @@ def test_identity_is_kept_by_a_later_field_at_what_was_before_alone():
     assert config.to_dict(Grown())["entries"] == []
 
 
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    each: Grown = Grown()
+    seed: int = 0
+    extra: int | None = config.later(3, before=None)
+
+
+def test_what_was_kept_before_a_later_field_is_restored_as_it_was():
+    kept = config.to_dict(Kept(seed=5))
+    assert config.restore(Kept, kept) == Kept(seed=5)
+    del kept["extra"], kept["each"]["better"], kept["each"]["entries"]
+    assert config.restore(Kept, kept) == Kept(Grown(better=False), 5, None)
+    assert config.from_dict(Kept, kept) == Kept(Grown(), 5, 3)
+
+
 def test_diff_names_the_dotted_keys():
     a, b = config.to_dict(Run("b")), config.to_dict(RUN)
     assert config.diff(a, a) == []

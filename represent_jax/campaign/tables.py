@@ -6,7 +6,13 @@ from typing import Any, NamedTuple
 
 from represent_jax.campaign import paper
 from represent_jax.campaign.statistics import Aggregate, aggregate
-from represent_jax.campaign.variants import ABLATIONS, GYM_DOMAINS, KITCHENS, NUMS_STRATEGIES
+from represent_jax.campaign.variants import (
+    ABLATIONS,
+    GYM_DOMAINS,
+    KITCHENS,
+    NUMS_STRATEGIES,
+    settings_hashes,
+)
 from represent_jax.errors import RepresentError, unknown
 from represent_jax.report.tables import Table
 from represent_jax.report.values import METHOD_NAMES, display_name, format_number
@@ -38,6 +44,7 @@ VARIANT_NAMES = {
 }
 _TARGETS = ("task", "strategy_1", "strategy_2")
 _RETURNS = ("return_best", "return_final")
+_OTHER_SETTINGS = " \N{DAGGER}"
 _OUTCOMES = ("kettle_distance", "success")
 
 
@@ -48,6 +55,7 @@ class Cell(NamedTuple):
       domain, target, method, quantity: what was measured.
       found: over seeds; None where there are no records.
       paper: mean, and standard deviation where there is one, in the paper; None if not there.
+      other_settings: of how many seeds the records are of settings that the preset no longer has.
     """
 
     domain: str
@@ -56,6 +64,7 @@ class Cell(NamedTuple):
     quantity: str
     found: Aggregate | None
     paper: tuple[float, ...] | None
+    other_settings: int = 0
 
 
 class Select:
@@ -65,10 +74,12 @@ class Select:
         """Sorts the records."""
         self.preset = preset
         self._values: dict[tuple[str, str, str, str], dict[int, float | None]] = {}
+        self._hashes: dict[tuple[str, str, str, str], dict[int, str | None]] = {}
         for record in records:
             if record["preset"] == preset:
                 where = tuple(record[n] for n in ("domain", "target", "method", "quantity"))
                 self._values.setdefault(where, {})[record["seed"]] = record["value"]
+                self._hashes.setdefault(where, {})[record["seed"]] = record.get("config_hash")
 
     def values(self, domain: str, target: str, method: str, quantity: str) -> dict[int, float]:
         """Returns the value of every seed that has one."""
@@ -84,11 +95,19 @@ class Select:
         published: tuple[float, ...] | float | None = None,
     ) -> Cell:
         """Aggregates the seeds of one figure."""
-        values = list(self.values(domain, target, method, quantity).values())
-        found = aggregate(values) if values else None
+        values = self.values(domain, target, method, quantity)
+        found = aggregate(list(values.values())) if values else None
         if published is not None and not isinstance(published, tuple):
             published = (published,)
-        return Cell(domain, target, method, quantity, found, published)
+        other = sum(self._has_other_settings(domain, target, method, quantity, s) for s in values)
+        return Cell(domain, target, method, quantity, found, published, other)
+
+    def _has_other_settings(
+        self, domain: str, target: str, method: str, quantity: str, seed: int
+    ) -> bool:
+        held = self._hashes[domain, target, method, quantity][seed]
+        known = settings_hashes(self.preset, domain, method, seed)
+        return held is not None and bool(known) and held not in known
 
 
 def correlations(select: Select) -> list[Cell]:
@@ -248,7 +267,7 @@ def to_table(title: str, cells: Sequence[Cell]) -> Table:
                 _plus_minus(found.mean, found.std, digits),
                 format_number(found.iqm, digits),
                 _interval(found.low, found.high, digits),
-                str(found.num),
+                str(found.num) + _mark(cell),
                 _plus_minus(*cell.paper, digits=digits) if cell.paper else "-",
             )
         )
@@ -265,7 +284,7 @@ def to_table(title: str, cells: Sequence[Cell]) -> Table:
             "paper",
         ),
         rows=tuple(rows),
-        note="IQM: interquartile mean over seeds, with its bootstrap interval.",
+        note="IQM: interquartile mean over seeds, with its bootstrap interval." + _marks(cells),
     )
 
 
@@ -302,6 +321,7 @@ def _to_grid(
             text += f" ({_plus_minus(*cell.paper, digits=digits)})"
         if cell.found.num < most_seeds and cell.method != "demonstrators":
             text += f" [{cell.found.num}]"
+        text += _mark(cell)
         shown.setdefault(_row_name(cell), {})[cell.method] = text
     note = f"Mean +- standard deviation over {most_seeds} seeds" if most_seeds > 1 else "One seed"
     if any(cell.found.num < most_seeds for cell in measured):
@@ -314,8 +334,19 @@ def _to_grid(
         rows=tuple(
             (name, *(row.get(method, "-") for method in methods)) for name, row in shown.items()
         ),
-        note=f"{note}.",
+        note=f"{note}.{_marks(cells)}",
     )
+
+
+def _mark(cell: Cell) -> str:
+    return _OTHER_SETTINGS if cell.other_settings and cell.method != "demonstrators" else ""
+
+
+def _marks(cells: Iterable[Cell]) -> str:
+    """What the mark means, where a cell has it."""
+    if not any(_mark(cell) for cell in cells):
+        return ""
+    return f" {_OTHER_SETTINGS.strip()}: of settings that the preset has no longer."
 
 
 def _digits(cell: Cell) -> int:

@@ -1,12 +1,13 @@
 """The runs behind the paper's tables: methods, ablations, and how far each has to go."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 from represent_jax import config as configs
 from represent_jax.errors import UsageError, unknown
 from represent_jax.methods.config import MethodConfig
-from represent_jax.methods.presets import make_config
+from represent_jax.methods.presets import PRESETS, make_config
 from represent_jax.methods.registry import setting_names
 
 GYM_DOMAINS = ("hopper", "half_cheetah", "inverted_double_pendulum")
@@ -99,6 +100,21 @@ VARIANTS = {
         for num in NUMS_STRATEGIES
     },
 }
+
+
+@functools.cache
+def settings_hashes(preset: str, domain: str, method: str, seed: int) -> frozenset[str]:
+    """Hashes of the settings that a preset has for what records call `method`, in this version.
+
+    Empty where records are of no preset itself, but of one with a seed of Phase 1 of its own.
+    """
+    if preset not in PRESETS:
+        return frozenset()
+    every = (variant for variant in VARIANTS.values() if variant.name == method)
+    return frozenset(
+        configs.config_hash(one.config(preset, domain, (f"seed={seed}",))) for one in every
+    )
+
 
 ABLATIONS = (
     *("no_reg", "no_bcd", "shared", "equal_units"),

@@ -17,6 +17,9 @@ from represent_jax.errors import RepresentError
 # In float32 a clipped action may lie half a unit in the last place past a float64 bound.
 _BOUND_TOLERANCE = 1e-6
 
+# Stands between the sources of demonstrations that were put together, in `metadata["source"]`.
+SOURCES = " + "
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 from brax.envs import base
 
+from represent_jax.config import require
 from represent_jax.envs import playground
 from represent_jax.envs.environment import Environment
 from represent_jax.envs.franka_kitchen import FrankaKitchen, FrankaKitchenHand
@@ -26,8 +27,8 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(_TASKS))
 
 
-def register(make_task: Callable[..., Task], name: str) -> None:
-    """Makes a task known by name.
+def register(make_task: Callable[..., Task | playground.Adapted], name: str) -> None:
+    """Makes a task, or an environment of Brax's kind in an `Adapted`, known by name.
 
     Raises:
       UsageError: the name is taken.
@@ -42,14 +43,14 @@ def make_env(name: str, backend: str = "auto", **task_options) -> base.Env:
 
     Args:
       name: a registered task, such as "half_cheetah"; "module:Class" of a `Task` that Python can
-        import, such as "my_robots:Swimmer"; or "playground:Name" of a MuJoCo Playground
-        environment, such as "playground:CartpoleBalance".
+        import, such as "my_robots:Swimmer", or of a function that returns an `Adapted`; or
+        "playground:Name" of a MuJoCo Playground environment, such as "playground:CartpoleBalance".
       backend: "mujoco" (C, for CPU hosts), "mjx" (XLA, for accelerators) or "auto", which
         picks by platform, but always "mujoco" where the task's scene for MJX is another.
       **task_options: passed to the task, such as `terminates=False`.
 
     Returns:
-      An `Environment`, or what `envs.playground` makes.
+      An `Environment`, or an `Adapted`.
 
     Raises:
       UsageError: unknown environment, backend or option, or an extra that is not installed.
@@ -64,6 +65,16 @@ def make_env(name: str, backend: str = "auto", **task_options) -> base.Env:
         task = make_task(**task_options)
     except TypeError as error:
         raise UsageError(f"environment {name!r}: {error}") from error
+    if isinstance(task, playground.Adapted):
+        require(
+            backend in ("auto", task.backend), "backend", f"{task.backend!r} or 'auto'", backend
+        )
+        return task
+    if not isinstance(task, Task):
+        raise UsageError(
+            f"environment {name!r}: expected an envs.Task, or an envs.Adapted around an "
+            f"environment of Brax's kind, found {task!r}"
+        )
     # Episodes of a light scene are not those of the full one: they have to be asked for.
     backend = "mujoco" if backend == "auto" and task.has_light_model else resolve_backend(backend)
     model = task.load_light_model() if backend == "mjx" else task.load_model()
@@ -71,13 +82,16 @@ def make_env(name: str, backend: str = "auto", **task_options) -> base.Env:
     return Environment(task, engine)
 
 
-def _imported(name: str) -> Callable[..., Task]:
-    """Finds the task of a "module:Class"."""
+def _imported(name: str) -> Callable[..., Task | playground.Adapted]:
+    """Finds what makes the environment of a "module:name"."""
     module, _, attribute = name.partition(":")
     try:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise UsageError(f"environment {name!r}: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, Task)):
-        raise UsageError(f"environment {name!r}: expected a class of envs.Task, found {found!r}")
+    if not callable(found):
+        raise UsageError(
+            f"environment {name!r}: expected a class of envs.Task, or a function that returns an "
+            f"envs.Adapted, found {found!r}"
+        )
     return found

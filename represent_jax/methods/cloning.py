@@ -169,7 +169,11 @@ def load_bc_policies(
     key = jax.random.PRNGKey(0)
     example = jax.eval_shape(lambda key: bc.finish(bc.init(key, rows, config.bc)), key)
     params = directory.load_output("bc", example)
-    return {config.merged_name: lambda obs: bc.act(params, obs, key, config.bc, env.action_size)}
+
+    def policy(obs, unused_key=None):
+        return bc.act(params, obs, key, config.bc, env.action_size)
+
+    return {config.merged_name: policy}
 
 
 def load_no_recurrent_policies(

@@ -106,12 +106,11 @@ def load_policies(
 ) -> dict[str, Callable[[jax.Array], jax.Array]]:
     """The modes of a run's generators, by strategy."""
     stacked = _load(config, env, directory).policy
-    # The mode draws nothing from the key.
-    key = jax.random.PRNGKey(0)
+    unused = jax.random.PRNGKey(0)
 
     def policy_of(params):
-        return lambda obs: airl.act(
-            params, obs, key, config.airl, env.action_size, deterministic=True
+        return lambda obs, key=None: airl.act(
+            params, obs, unused, config.airl, env.action_size, deterministic=True
         )
 
     return {name: policy_of(_member(stacked, i)) for i, name in enumerate(config.group_names)}

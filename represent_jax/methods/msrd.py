@@ -128,12 +128,12 @@ def load_policies(
     config: MsrdMethodConfig, env: Environment, directory: RunDirectory
 ) -> dict[str, Callable[[jax.Array], jax.Array]]:
     """The generators of a run, by strategy: there is none of the task's."""
-    stacked, key = _load(config, env, directory).policies, jax.random.PRNGKey(0)
+    stacked, unused = _load(config, env, directory).policies, jax.random.PRNGKey(0)
 
     def policy_of(i):
         params = jax.tree.map(lambda x: x[i], stacked)
-        return lambda obs: msrd.act(
-            params, obs, key, config.msrd, env.action_size, deterministic=True
+        return lambda obs, key=None: msrd.act(
+            params, obs, unused, config.msrd, env.action_size, deterministic=True
         )
 
     return {name: policy_of(i) for i, name in enumerate(config.group_names)}

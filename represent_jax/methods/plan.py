@@ -37,6 +37,8 @@ class Stage:
       reports: whether the output is a part of the run's results.
       sees_pauses: whether it learns from whole demonstrations, `Problem.demonstrations`.
       before_rewards: whether rewards are learned from it, so that its seed is Phase 1's.
+      revision: raised when the stage makes something else of the same settings, so that a campaign
+        does not take what was made before for it.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Stage:
     reports: bool = False
     sees_pauses: bool = False
     before_rewards: bool = False
+    revision: int = 1
 
 
 def stage_key(seed: int, name: str) -> jax.Array:
@@ -110,6 +113,7 @@ def execute(
       RepresentError: a loss diverged, or Phase 1's reward is not finite.
     """
     stage_names(stages, until)
+    provenance()  # Of the code that is loaded now: a checkout may change while the run lasts.
     clock, outputs = Clock(directory), {}
     for stage in stages:
         with clock(stage.name):
@@ -154,6 +158,7 @@ def nodes(
                 "seed": seed,
                 **(judged if stage.reports else whole if stage.sees_pauses else common),
                 **configs.identity(stage.settings),
+                **({"revision": stage.revision} if stage.revision > 1 else {}),
             },
             inputs=tuple(made[before] for before in stage.inputs),
             run=functools.partial(run_stage, seed, stage),

@@ -33,7 +33,8 @@ class Method(NamedTuple):
       config: class of its settings.
       plan: its stages, `plan(config, problem, checkpoint_seconds)`, for `methods.plan`.
       load_rewards, load_policies: from settings, environment and run directory to functions
-        `reward(obs_t, action_t, next_obs_t)` and `policy(obs)`, by target.
+        `reward(obs_t, action_t, next_obs_t)` and `policy(obs, key=None)`, by target; what has no
+        use for the key takes none into account.
       policies_in: the stage whose output holds the policies.
       configure: turns the settings of a preset and a domain, by name, into the method's.
     """

@@ -31,7 +31,13 @@ def plan(
 
     return (
         *first_stages(config, problem, checkpoint_seconds),
-        Stage("regression", regress, ("noise", "curve"), {"regression": config.regression}),
+        Stage(
+            "regression",
+            regress,
+            ("noise", "curve"),
+            {"regression": config.regression},
+            revision=config.regression.revision,
+        ),
         *last_stages(
             config,
             problem,

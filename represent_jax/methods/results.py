@@ -38,6 +38,8 @@ def describe(config: MethodConfig, problem: Problem) -> dict[str, Any]:
     """What every run's results begin with."""
     demonstrations = problem.demonstrations
     groups = [demonstrations.of_strategy(i) for i in range(demonstrations.num_strategies)]
+    horizon = problem.env.horizon
+    cut_short = [t for t in demonstrations.trajectories if t.length < horizon and not t.terminated]
     given = {
         "actions": demonstrations.has_actions,
         "rewards": demonstrations.has_rewards,
@@ -64,6 +66,8 @@ def describe(config: MethodConfig, problem: Problem) -> dict[str, Any]:
             }
             for name, group in zip(config.group_names, groups, strict=True)
         ],
+        "horizon": horizon,
+        "cut_short": len(cut_short),
         "source": demonstrations.metadata.get("source"),
         "missing": [what for what, there in given.items() if not there],
         **provenance(),

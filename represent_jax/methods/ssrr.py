@@ -75,7 +75,13 @@ def plan(
     settings = {"each": config.regression, "population": config.population}
     return (
         *represent.first_stages(config, problem, checkpoint_seconds),
-        Stage("regression", regress, ("noise", "curve"), settings),
+        Stage(
+            "regression",
+            regress,
+            ("noise", "curve"),
+            settings,
+            revision=config.regression.revision,
+        ),
         *represent.last_stages(
             config,
             problem,

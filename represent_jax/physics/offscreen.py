@@ -18,16 +18,16 @@ _LIBRARIES = ("egl", "osmesa", "glfw")
 
 
 def find_camera(model: mujoco.MjModel, camera: str | int = -1) -> mujoco.MjvCamera:
-    """Returns one of the model's cameras by name or index, or the free camera, -1.
+    """Returns one of the model's cameras by name or index, or the free camera, "free" or -1.
 
     Raises:
         UsageError: the model has no such camera.
     """
     if isinstance(camera, str):
-        names = [model.camera(i).name for i in range(model.ncam)]
+        names = ["free", *(model.camera(i).name for i in range(model.ncam))]
         if camera not in names:
-            raise unknown("camera", camera, names or ["-1 (free)"])
-        camera = names.index(camera)
+            raise unknown("camera", camera, [name for name in names if name])
+        camera = names.index(camera) - 1
     if not -1 <= camera < model.ncam:
         raise unknown("camera", str(camera), [str(i) for i in range(-1, model.ncam)])
     found = mujoco.MjvCamera()
@@ -70,10 +70,8 @@ def renderer(
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     if plain:
         model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
-    gl = gl_context(width, height)
+    gl, context = _open(model)
     try:
-        gl.make_current()
-        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
         scene = mujoco.MjvScene(model, maxgeom=max(1000, 4 * model.ngeom))
         if plain:
@@ -91,13 +89,23 @@ def renderer(
             return frame[::-1]
 
         yield draw
-        context.free()
     finally:
+        context.free()
         gl.free()
 
 
-def gl_context(width: int, height: int) -> Any:
-    """Returns a context of the first GL library that works; MUJOCO_GL names the only one to try.
+def check_available() -> None:
+    """Checks that something can be drawn here.
+
+    Raises:
+        RepresentError: no OpenGL library works.
+    """
+    with renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), (64, 64)):
+        pass
+
+
+def _open(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
+    """Opens the first GL library that works; MUJOCO_GL names the only one to try.
 
     MuJoCo's own choice is made on its import, and is a window where there may be no display.
 
@@ -105,19 +113,25 @@ def gl_context(width: int, height: int) -> Any:
         RepresentError: none works.
     """
     asked = os.environ.get("MUJOCO_GL", "").lower()
+    width, height = model.vis.global_.offwidth, model.vis.global_.offheight
     reasons = []
     for library in [asked] if asked in _LIBRARIES else _LIBRARIES:
         if library == "glfw" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
             reasons.append("glfw: no display")
             continue
+        gl = None
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                return importlib.import_module(f"mujoco.{library}").GLContext(width, height)
+                gl = importlib.import_module(f"mujoco.{library}").GLContext(width, height)
+            gl.make_current()
+            return gl, mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         except Exception as error:  # Each library fails in its own way where it is not installed.
             reasons.append(f"{library}: {str(error).splitlines()[0] if str(error) else error!r}")
+            if gl is not None:
+                gl.free()
     raise RepresentError(
-        "pictures need an OpenGL library that draws off-screen, and none was found "
-        f"({'; '.join(reasons)}); install EGL (Debian: libegl1) or OSMesa (libosmesa6), "
-        "and set MUJOCO_GL=egl or MUJOCO_GL=osmesa to choose one"
+        f"pictures of {width} x {height} pixels need an OpenGL library that draws off-screen, and "
+        f"none works ({'; '.join(reasons)}); install EGL (Debian: libegl1) or OSMesa "
+        "(libosmesa6), and set MUJOCO_GL=egl or MUJOCO_GL=osmesa to choose one"
     )

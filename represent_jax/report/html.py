@@ -11,6 +11,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from represent_jax.data.atomic import replacing
+from represent_jax.data.trajectories import SOURCES
 from represent_jax.report import contents, diagnostics, figures, showcase, tables
 from represent_jax.report.page import document, flat, gallery, pairs, table, text
 from represent_jax.report.values import (
@@ -135,6 +136,7 @@ def _notices(results: Mapping[str, Any]) -> str:
             "and strategy reward may share what was learned in any way."
         )
     notices += _source(results)
+    notices += tables.cut_short(results)
     notices += tables.missing(results)
     return "".join(f"<p class=notice>{text(notice)}</p>" for notice in notices)
 
@@ -145,7 +147,7 @@ def _source(results: Mapping[str, Any]) -> list[str]:
     if not source:
         return []
     said = [f"Where the demonstrations are from, by their file: {source}."]
-    if str(source).startswith(_SCRIPTED):
+    if all(one.startswith(_SCRIPTED) for one in str(source).split(SOURCES)):
         said.append(_SCRIPTED_NOTE)
     return [" ".join(said)]
 

@@ -40,6 +40,18 @@ def missing(results: Mapping[str, Any]) -> list[str]:
     return [text for what, text in _MISSING.items() if what in (results.get("missing") or ())]
 
 
+def cut_short(results: Mapping[str, Any]) -> list[str]:
+    """Returns a sentence where demonstrations stop early though nothing ended them."""
+    num = results.get("cut_short", 0)
+    if not num:
+        return []
+    return [
+        f"{num} of {sum(one['num'] for one in results['demonstrators'])} demonstrations stop "
+        f"before the horizon of {results['horizon']} steps though nothing ended them: their "
+        "returns are of fewer steps than those of the policies beside them."
+    ]
+
+
 def targets(results: Mapping[str, Any]) -> list[str]:
     """Returns the names of the learned rewards: "task", "strategy_1", ..."""
     return list(results.get("targets") or ("task", *groups(results)))

@@ -88,7 +88,7 @@ def check_available() -> None:
         RepresentError: ffmpeg or a GL library is missing.
     """
     _ffmpeg()
-    offscreen.gl_context(64, 64).free()
+    offscreen.check_available()
 
 
 def _checked(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:

@@ -74,9 +74,10 @@ class CurveConfig:
         reward_floor: no step of a rollout counts less than this quantile of the demonstrated
             steps' initial rewards; None: whatever they count. Noise leads where no demonstration
             was, where the initial reward is extrapolated: one level at which robots fall would set
-            the scale of all others.
+            the scale of all others. For whoever computes the returns that `fit` is given; see
+            `methods.pipeline.fit_curves`.
         targets: what the regression learns from: the "curve", or the "returns" of each level as
-            they are, without a curve through them (an ablation).
+            they are, without a curve through them (an ablation). For the regression's caller.
         num_iterations: Levenberg-Marquardt iterations of every start.
         steepest: largest -k, per unit of noise level.
         flattest: smallest -k; above zero, so that the sigmoid can only fall.

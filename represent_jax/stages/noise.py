@@ -26,8 +26,9 @@ class NoiseConfig:
       level_step: distance between two levels; the first is 0.
       trajectories_per_level: episodes at each level.
       actions: what Phase 1's policy does where noise lets it: "sampled" actions, as SSRR's does, or
-        their "mode".
-      action_size: random actions are uniform in [-action_size, action_size]; 1 is all there is.
+        their "mode". For whoever makes `run`'s policy function; see `methods.pipeline.run_noise`.
+      action_size: random actions are uniform in [-action_size, action_size]; 1 is all there is. For
+        whoever makes `run`'s `Episode`, as its `noise_size`.
     """
 
     num_levels: int = 20

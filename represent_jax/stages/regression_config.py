@@ -80,6 +80,11 @@ class RegressionConfig:
     within_demonstrations: bool = later(False)
     learn_units: bool = later(True, before=False)
 
+    @property
+    def revision(self) -> int:
+        """Of what is made of these settings: 2 since R^0 sees all that was demonstrated."""
+        return 2 if self.within_demonstrations and self.input_quantile is not None else 1
+
     def __post_init__(self) -> None:
         for field in (
             *("num_updates", "num_snippets", "num_demonstration_states"),

@@ -16,23 +16,32 @@ class HeldKeys:
 
     def __init__(self, patience: float = 1.0):
         self.patience = patience
+        self._heard = float("-inf")
         self.release()
 
     def update(self, held: Iterable[str], now: float) -> None:
         """Takes over which keys are down at a time in seconds."""
         held = frozenset(held)
         self._touched |= held - self._held
-        self._held, self._heard = held, now
+        self._held = held
+        self.hear(now)
+
+    def hear(self, now: float) -> None:
+        """Notes that something was heard at a time in seconds, whatever it was."""
+        self._heard = now
+
+    def silence(self, now: float) -> float:
+        """Returns for how many seconds nothing was heard."""
+        return now - self._heard
 
     def release(self) -> None:
         """Releases all keys."""
         self._held: frozenset[str] = frozenset()
         self._touched: frozenset[str] = frozenset()
-        self._heard = float("-inf")
 
     def take(self, now: float) -> frozenset[str]:
         """Returns the keys that count for the next step."""
-        if now - self._heard > self.patience:
+        if self.silence(now) > self.patience:
             self.release()
         taken = self._held | self._touched
         self._touched = frozenset()

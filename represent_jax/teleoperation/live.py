@@ -14,6 +14,11 @@ from represent_jax.teleoperation.painter import Painter
 from represent_jax.teleoperation.session import Session
 
 _MAX_HELD = 32
+_STATUS_SECONDS = 0.05
+# A page that drives says so four times a second. Whoever was not heard of for so long has lost the
+# connection, and the episode should not go on without them.
+_GONE_SECONDS = 3.0
+_GONE = "Paused: the page that drives has fallen silent."
 
 
 class Live:
@@ -50,7 +55,7 @@ class Live:
         self.no_pictures = ""
         self._painter = painter
         self._on_status, self._on_picture = on_status, on_picture
-        self._interval = 1.0 / fps
+        self._picture_seconds = 1.0 / fps
         self._keys = HeldKeys()
         self._pace = Pace(session.env.engine.dt)
         self._stepping, self._painting = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
@@ -106,6 +111,7 @@ class Live:
             RepresentError: an episode could not be saved; it is kept.
         """
         do = message.get("do")
+        self._keys.hear(time.monotonic())
         if do == "keys":
             held = _argument(message, "held", list)[:_MAX_HELD]
             self._keys.update([str(key) for key in held], time.monotonic())
@@ -157,6 +163,8 @@ class Live:
                 if held_at_steps:
                     await self._on_thread(self._stepping, self._advance, held_at_steps)
                     self.refresh()
+                if self._keys.silence(now) > _GONE_SECONDS:
+                    await self._on_thread(self._stepping, self.session.pause, _GONE)
                 await asyncio.sleep(self._pace.wait(time.monotonic()))
 
     def _advance(self, held_at_steps: Sequence[frozenset[str]]) -> None:
@@ -169,14 +177,14 @@ class Live:
             figures = await self._on_thread(self._stepping, self.session.figures)
             view = {"camera": self._painter.camera, "speed": self._pace.speed}
             self._on_status(figures | view)
-            await self._until(started + self._interval)
+            await self._until(started + _STATUS_SECONDS)
 
     async def _paint(self) -> None:
         while not self.no_pictures:
             started = await self._next(self._unpainted)
             qpos = await self._on_thread(self._stepping, lambda: self.session.qpos)
             self._on_picture(await self._on_thread(self._painting, self._painter.paint, qpos))
-            await self._until(started + self._interval)
+            await self._until(started + self._picture_seconds)
 
     async def _next(self, event: asyncio.Event) -> float:
         """Waits for news, and returns when they came."""

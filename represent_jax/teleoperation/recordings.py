@@ -15,7 +15,7 @@ from brax.envs import base
 
 from represent_jax.data.atomic import disk_errors
 from represent_jax.data.npz import load_demonstrations, save_demonstrations
-from represent_jax.data.trajectories import Demonstrations, Trajectory
+from represent_jax.data.trajectories import SOURCES, Demonstrations, Trajectory
 from represent_jax.errors import RepresentError, UsageError
 
 _METADATA_KEY = "teleoperation"
@@ -71,7 +71,10 @@ def append(
                 f"strategy: expected 1 to {known + 1}, found {trajectory.strategy + 1}; strategies "
                 f"are numbered without a gap, and {path} has {known}"
             )
-        metadata = dict(before.metadata) if before else {"source": "teleoperation"}
+        metadata = dict(before.metadata) if before else {}
+        if _METADATA_KEY not in metadata:
+            sources = [metadata["source"]] if "source" in metadata else []
+            metadata["source"] = SOURCES.join([*sources, _METADATA_KEY])
         seeds = [*(reset_seeds(before) if before else ()), reset_seed]
         metadata[_METADATA_KEY] = {"reset_seeds": seeds}
         trajectories = (*(before.trajectories if before else ()), trajectory)

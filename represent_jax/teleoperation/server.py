@@ -10,6 +10,7 @@ import asyncio
 import json
 import math
 import signal
+import socket
 from collections.abc import Callable
 from importlib import resources
 from typing import Any
@@ -114,7 +115,7 @@ class Server:
         """Says goodbye to every page."""
         del app
         for connection in list(self._connections):
-            await connection.socket.close(code=aiohttp.WSCloseCode.GOING_AWAY)
+            await connection.page.close(code=aiohttp.WSCloseCode.GOING_AWAY)
 
     async def recorded(self, request: web.Request) -> web.Response:
         """Lists the episodes of the file."""
@@ -123,11 +124,11 @@ class Server:
 
     async def connect(self, request: web.Request) -> web.WebSocketResponse:
         """Talks to one page until its connection ends."""
-        socket = web.WebSocketResponse(
+        page = web.WebSocketResponse(
             heartbeat=_HEARTBEAT_SECONDS, max_msg_size=_MAX_MESSAGE_BYTES, compress=False
         )
-        await socket.prepare(request)
-        connection = _Connection(socket)
+        await page.prepare(request)
+        connection = _Connection(page)
         connection.put("hello", self._hello())
         self._connections.append(connection)
         if self._driver is None:
@@ -135,7 +136,7 @@ class Server:
         self._tell_roles()
         sending = asyncio.create_task(connection.send())
         try:
-            async for message in socket:
+            async for message in page:
                 if message.type == aiohttp.WSMsgType.TEXT:
                     await self._hear(connection, message.data)
         finally:
@@ -145,7 +146,7 @@ class Server:
                 self._driver = None
                 self.live.leave()
             self._tell_roles()
-        return socket
+        return page
 
     async def _hear(self, connection: "_Connection", text: str) -> None:
         try:
@@ -168,6 +169,7 @@ class Server:
             "env": session.env.name,
             "path": str(session.path),
             "keys": dict(keyboard.keys) if keyboard else {},
+            "watched": session.watched,
             "cameras": self.live.cameras,
             "no_pictures": self.live.no_pictures,
         }
@@ -190,8 +192,8 @@ class Server:
 class _Connection:
     """One page. Of each kind of message only the last waits: a slow page skips pictures."""
 
-    def __init__(self, socket: web.WebSocketResponse):
-        self.socket = socket
+    def __init__(self, page: web.WebSocketResponse):
+        self.page = page
         self._waiting: dict[str, Any] = {}
         self._any = asyncio.Event()
 
@@ -207,9 +209,9 @@ class _Connection:
                 waiting, self._waiting = self._waiting, {}
                 for kind, content in waiting.items():
                     if isinstance(content, bytes):
-                        await self.socket.send_bytes(content)
+                        await self.page.send_bytes(content)
                     else:
-                        await self.socket.send_json({"kind": kind, **content}, dumps=_dumps)
+                        await self.page.send_json({"kind": kind, **content}, dumps=_dumps)
         except ConnectionError:
             return  # The page is gone, as the loop that reads from it is about to find out.
 
@@ -269,6 +271,10 @@ async def _serve(session, painter, host, port, fps, announce) -> None:
     try:
         try:
             await web.TCPSite(runner, host, port).start()
+        except socket.gaierror as error:
+            raise UsageError(
+                f"host: expected an address of this machine, found {host!r} ({error.strerror})"
+            ) from error
         except OSError as error:
             raise UsageError(
                 f"cannot listen on {host}:{port} ({error.strerror}); choose another --port"

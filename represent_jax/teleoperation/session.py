@@ -65,7 +65,8 @@ class Session:
             path: file of demonstrations; one that exists is added to.
             horizon: steps after which an episode is over; the environment's if None.
             seed: seed of the initial states; another one in every session if None.
-            policy: acts in place of a driver, from `obs [obs_dim]`; its episodes are not recorded.
+            policy: acts in place of a driver, from `obs [obs_dim]`, and is compiled; its episodes
+                are not recorded.
 
         Raises:
             UsageError: the horizon is no positive int, or the file is of another environment.
@@ -76,15 +77,23 @@ class Session:
         require(self.horizon > 0, "horizon", "a positive int", self.horizon)
         self.demonstrations = recordings.read(path, env)
         self.keyboard = None if policy else env.task.keyboard(env.engine.model)
-        self._policy = policy
+        self._policy = jax.jit(policy) if policy else None
         self._seeds = np.random.default_rng(seed)
         self._reset = jax.jit(env.reset)
         self._step = jax.jit(env.step)
         self._readings = jax.jit(env.task.readings)
         self._played: Trajectory | None = None
+        self._playing: int | None = None
         self._draw_initial_state()
         self._step(self._state, np.zeros(env.action_size, np.float32))
+        if self._policy:
+            self._policy(self._state.obs)
         self.notice = ""
+
+    @property
+    def watched(self) -> bool:
+        """Whether a policy drives."""
+        return self._policy is not None
 
     @property
     def moving(self) -> bool:
@@ -118,6 +127,7 @@ class Session:
             "phase": self.phase,
             "notice": self.notice,
             "step": self.num_steps,
+            "playing": self._playing,
             "horizon": self._played.length if self._played else self.horizon,
             "seconds": self.num_steps * self.env.engine.dt,
             "return": self.total_reward,
@@ -159,10 +169,10 @@ class Session:
         self.phase = Phase.DRIVING
         self.notice = "Recording." if self.keyboard else "Watching; nothing is recorded."
 
-    def pause(self) -> None:
-        """Stands still; does nothing where no episode is driven."""
+    def pause(self, notice: str = "Paused.") -> None:
+        """Stands still, and says why; does nothing where no episode is driven."""
         if self.phase is Phase.DRIVING:
-            self.phase, self.notice = Phase.PAUSED, "Paused."
+            self.phase, self.notice = Phase.PAUSED, notice
 
     def resume(self) -> None:
         """Goes on with a paused episode.
@@ -232,6 +242,7 @@ class Session:
                 f"play: episode {episode} was not recorded here, and where it started is not known"
             )
         self._begin(seed)
+        self._playing = episode
         self._played = self.demonstrations.trajectories[episode - 1]
         self._differs = False
         self.phase, self.notice = Phase.PLAYING, f"Playing episode {episode}."
@@ -297,7 +308,7 @@ class Session:
         self._actions: list[np.ndarray] = []
         self._rewards: list[float] = []
         self._terminated = False
-        self._played = None
+        self._played, self._playing = None, None
         self.phase = Phase.READY
 
     def _require(self, command: str, *phases: Phase) -> None:

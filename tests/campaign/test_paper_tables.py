@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from represent_jax.campaign import embedded, formats, paper, tables
+from represent_jax.campaign.variants import VARIANTS
+from represent_jax.config import config_hash
 from represent_jax.errors import RepresentError, UsageError
 
 
@@ -27,6 +29,23 @@ def test_seeds_are_aggregated_and_the_newest_record_of_a_run_counts():
     (cell,) = cells
     assert cell.found.num == 2 and cell.found.mean == pytest.approx(0.8)
     assert cell.paper == (0.949, 0.002)
+
+
+def test_records_of_settings_that_the_preset_no_longer_has_are_marked():
+    config = VARIANTS["represent"].config("quick", "hopper", ("seed=1",))
+    records = [
+        _record("task", "return_final", 1, 1.0) | {"config_hash": config_hash(config)},
+        _record("task", "return_final", 2, 2.0) | {"config_hash": "0" * 12},
+        _record("strategy_1", "return_final", 1, 1.0) | {"config_hash": config_hash(config)},
+    ]
+    title, cells = tables.make("2", records, "quick")
+    assert {cell.target: cell.other_settings for cell in cells} == {"task": 1, "strategy_1": 0}
+    (grid,) = tables.to_grids(title, cells)
+    marked = {row[0]: row[1].endswith("\N{DAGGER}") for row in grid.rows}
+    assert marked == {"Hopper, task": True, "Hopper, strategy 1": False}
+    assert grid.note.endswith("\N{DAGGER}: of settings that the preset has no longer.")
+    one = [record | {"preset": "quick_one_phase_1"} for record in records]
+    assert not any(c.other_settings for c in tables.make("2", one, "quick_one_phase_1")[1])
 
 
 def test_imitation_is_shown_as_a_method_of_its_own():

@@ -140,6 +140,21 @@ def _hashes(config, problem):
     return {stage: node.hash for stage, node in nodes(config, problem, stages, "run").items()}
 
 
+def test_a_raised_revision_renews_a_stage_and_what_lies_behind_it():
+    config = VARIANTS["represent"].config("smoke", "half_cheetah")
+    problem = make_problem(
+        config, make_env("half_cheetah", "mujoco"), load_demonstrations("half_cheetah")
+    )
+    stages = find_method("represent").plan(config, problem)
+    raised = [
+        dataclasses.replace(stage, revision=2) if stage.name == "regression" else stage
+        for stage in stages
+    ]
+    before, after = (nodes(config, problem, each, "run") for each in (stages, raised))
+    same = {name for name in before if before[name].hash == after[name].hash}
+    assert same == {"airl", "airl_evaluation", "noise", "curve"}
+
+
 def test_judges_and_recurrent_clones_depend_on_pauses_and_other_stages_do_not():
     env = make_env("half_cheetah", "mujoco")
     shown = load_demonstrations("half_cheetah")

@@ -201,6 +201,7 @@ def test_inputs_become_strategies_in_order(tmp_path):
     held = formats.read("arrays", [one, two], "cart")
     assert [(t.strategy, t.length) for t in held.trajectories] == [(0, 3), (1, 2)]
     assert [source["input"] for source in held.metadata["inputs"]] == [one, two]
+    assert held.metadata["source"] == f"{one} + {two}"
     formats.write("arrays", str(tmp_path / "both.npz"), held)
     again = formats.read("arrays", [str(tmp_path / "both.npz"), two], "cart")
     assert [t.strategy for t in again.trajectories] == [0, 1, 2]
@@ -238,7 +239,7 @@ def test_inputs_that_do_not_go_together(tmp_path):
 @pytest.mark.parametrize(
     "arrays, message",
     [
-        ({"acts": np.zeros((3, 1))}, "no observations, it has acts"),
+        ({"acts": np.zeros((3, 1))}, "no observations: expected observations or obs, found acts"),
         ({"obs": np.zeros((3, 2)), "acts": np.zeros((3, 1))}, "actions has 3 rows, expected 2"),
         ({"obs": np.zeros((3, 2)), "dones": np.ones(3)}, "'dones' does not say"),
         ({"obs": np.zeros((3, 2)), "terminals": np.zeros(3)}, "neither 'timeouts' nor"),

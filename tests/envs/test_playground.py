@@ -12,7 +12,7 @@ from flax import struct
 import represent_jax as rj
 from represent_jax.agents import rollout, sac
 from represent_jax.data import Demonstrations, unpad
-from represent_jax.envs import Episode, Task
+from represent_jax.envs import Episode, Task, registry
 from represent_jax.envs.playground import Adapted
 from represent_jax.errors import UsageError
 
@@ -110,12 +110,28 @@ def test_a_task_is_found_by_its_place(monkeypatch):
     monkeypatch.setitem(sys.modules, "my_robots", module)
     with pytest.raises(UsageError, match="abstract"):
         rj.make_env("my_robots:Still")
-    with pytest.raises(UsageError, match=r"expected a class of envs\.Task, found 3"):
+    with pytest.raises(UsageError, match=r"expected a class of envs\.Task, .*found 3"):
         rj.make_env("my_robots:number")
     with pytest.raises(UsageError, match="has no attribute 'Walker'"):
         rj.make_env("my_robots:Walker")
     with pytest.raises(UsageError, match="No module named 'nobodys_robots'"):
         rj.make_env("nobodys_robots:Walker")
+
+
+def test_an_environment_of_ones_own_is_made_by_name(monkeypatch):
+    monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
+    registry.register(lambda horizon=7: Adapted(Drift(), "drift", horizon), "drift")
+    env = rj.make_env("drift", horizon=9)
+    assert isinstance(env, Adapted) and env.horizon == 9
+    module = types.ModuleType("my_robots")
+    module.drift = lambda: Adapted(Drift(), "drift", 7)
+    module.plain = Drift
+    monkeypatch.setitem(sys.modules, "my_robots", module)
+    assert rj.make_env("my_robots:drift", "mjx").horizon == 7
+    with pytest.raises(UsageError, match="backend: expected 'mjx' or 'auto', found 'mujoco'"):
+        rj.make_env("drift", "mujoco")
+    with pytest.raises(UsageError, match=r"my_robots:plain.*expected an envs.Task, or an envs.Ada"):
+        rj.make_env("my_robots:plain")
 
 
 def test_playground_that_is_not_installed_names_the_extra(monkeypatch):

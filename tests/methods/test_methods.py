@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 from launcher import ROOT, finish, launch, log_of, results_of
@@ -36,6 +37,8 @@ def test_ssrr_on_one_strategy_with_ppo_throughout(tmp_path):
     obs, action = np.zeros((3, 17), np.float32), np.zeros((3, 6), np.float32)
     assert rj.load_reward(out)(obs, action, obs, "strategy_2").shape == (3,)
     assert rj.load_policy(out, "strategy_2")(obs).shape == (3, 6)
+    keyed = rj.load_policy(out, "strategy_2")(obs, jax.random.PRNGKey(0))
+    assert keyed.shape == (3, 6)
 
 
 def test_a_policy_for_some_of_the_targets(tmp_path):

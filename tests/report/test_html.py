@@ -14,6 +14,7 @@ from represent_jax.methods.config import Problem
 from represent_jax.methods.presets import make_config
 from represent_jax.methods.results import describe
 from represent_jax.report import html as html_page
+from represent_jax.report import tables
 from represent_jax.report.html import write_report
 
 VOID = {"meta", "img"}
@@ -91,6 +92,16 @@ def test_one_strategy_alone_is_said_to_decompose_nothing(run_path, results):
     assert "nothing to decompose" in read(write_report(run_path))[0]
 
 
+def test_demonstrations_that_stop_early_are_said_to(run_path, results):
+    assert "though nothing ended them" not in read(write_report(run_path))[0]
+    demonstrators = [{"name": f"strategy_{i}", "return_mean": 1.0, "num": 3} for i in (1, 2)]
+    short = {"horizon": 50, "cut_short": 2, "demonstrators": demonstrators}
+    assert tables.cut_short(results | short) == [
+        "2 of 6 demonstrations stop before the horizon of 50 steps though nothing ended them: "
+        "their returns are of fewer steps than those of the policies beside them."
+    ]
+
+
 def test_the_source_of_the_demonstrations_is_told(run_path, results):
     assert html_page._notices(results | {"source": None}) == html_page._notices(results) == ""
     (run_path / "results.json").write_text(json.dumps(results | {"source": "my <lab>"}))
@@ -101,11 +112,24 @@ def test_the_source_of_the_demonstrations_is_told(run_path, results):
 @pytest.mark.parametrize("env", ["franka_kitchen", "franka_kitchen_hand"])
 def test_a_kitchen_nobody_drove_is_said_to_be_one(run_path, results, env):
     given = rj.load_demonstrations(env)
-    problem = Problem(types.SimpleNamespace(backend="mujoco"), given, given, ())
-    source = describe(make_config("smoke", env), problem)["source"]
+    problem = Problem(types.SimpleNamespace(backend="mujoco", horizon=500), given, given, ())
+    described = describe(make_config("smoke", env), problem)
+    assert (described["horizon"], described["cut_short"]) == (500, 0)
+    source = described["source"]
     (run_path / "results.json").write_text(json.dumps(results | {"source": source}))
     text, _ = read(write_report(run_path))
-    assert source in text and "Scripted operators, not people, drove the robot" in text
+    note = "Scripted operators, not people, drove the robot"
+    assert source in text and note in text
+    both = results | {"source": f"{source} + teleoperation"}
+    (run_path / "results.json").write_text(json.dumps(both))
+    text, _ = read(write_report(run_path))
+    assert f"{source} + teleoperation" in text and note not in text
+
+
+def test_demonstrations_that_nothing_ended_before_the_horizon_are_counted():
+    given = rj.load_demonstrations("franka_kitchen")
+    problem = Problem(types.SimpleNamespace(backend="mujoco", horizon=501), given, given, ())
+    assert describe(make_config("smoke", "franka_kitchen"), problem)["cut_short"] == 10
 
 
 def test_text_from_the_run_is_escaped(run_path, results):

@@ -32,7 +32,7 @@ def gl():
     """Skips where nothing can draw."""
     pytest.importorskip("imageio_ffmpeg")
     try:
-        offscreen.gl_context(64, 64).free()
+        offscreen.check_available()
     except RepresentError as error:
         pytest.skip(str(error))
 
@@ -113,10 +113,3 @@ def test_without_gl_the_message_says_what_to_install(model, monkeypatch, tmp_pat
     with pytest.raises(RepresentError, match=r"glfw: no display.*libegl1"):
         video.render(model, np.zeros((2, 1)), tmp_path / "a.mp4", fps=24)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(("mode", "expected"), [("fixed", -1), ("track", 0), ("trackcom", 0)])
-def test_a_camera_that_follows_the_robot_is_the_default(mode, expected):
-    body = f'<body><geom size=".3"/><camera mode="{mode}"/></body>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-    assert offscreen.default_camera(model) == expected

@@ -13,7 +13,7 @@ from represent_jax.errors import UsageError
 from represent_jax.methods.config import make_problem
 from represent_jax.methods.pipeline import transitions_of
 from represent_jax.methods.presets import make_config
-from represent_jax.stages import airl
+from represent_jax.stages import airl, discriminator
 
 SMOKE = make_config("smoke", "half_cheetah")
 
@@ -63,6 +63,61 @@ def test_states_alone_are_imitated_from_a_random_policy(problem):
     train = jax.jit(lambda state: airl.train(state, problem.env, states, config, 2))
     _, metrics = train(state)
     assert all(bool(jnp.isfinite(value)) for value in metrics.values())
+
+
+@pytest.mark.parametrize("agent", ["sac", "ppo"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_generator_is_paid_the_bounded_f_less_log_pi_that_sac_has_anyway(problem, agent, sign):
+    still = dataclasses.replace(SMOKE.airl.discriminator, learning_rate=1e-12, weight_decay=0.0)
+    config = dataclasses.replace(
+        SMOKE.airl, agent=agent, discriminator=still, reward_scale=0.5, reward_clip=2.0
+    )
+    demonstrations = transitions_of(problem.demonstrations)[0]
+
+    @jax.jit
+    def one_step(key):
+        state = airl.init(key, problem.env, demonstrations, config)
+        params = state.discriminator.params
+        constant = params._replace(g=_always(sign * 50.0, params.g), h=_always(0.0, params.h))
+        state = state.replace(discriminator=state.discriminator.replace(params=constant))
+        return airl.step(state, problem.env, demonstrations, config)
+
+    _, metrics = one_step(jax.random.PRNGKey(0))
+    log_pi = 0.0 if agent == "sac" else config.discriminator.log_prob_clip
+    paid = sign * float(metrics["batch_reward"])
+    assert 0.5 * (2.0 - log_pi) - 1e-5 <= paid <= 0.5 * (2.0 + log_pi) + 1e-5
+
+
+def _always(value, params):
+    """Parameters of a network that returns the value, whatever it sees."""
+
+    def leaf(path, x):
+        return jnp.full_like(x, value if path[-1].key == "bias" and x.shape == (1,) else 0.0)
+
+    return jax.tree_util.tree_map_with_path(leaf, params)
+
+
+@pytest.mark.parametrize("agent", ["sac", "ppo"])
+def test_the_discriminator_learns_to_prefer_what_was_demonstrated(problem, agent):
+    quick = dataclasses.replace(SMOKE.airl.discriminator, learning_rate=3e-3)
+    config = dataclasses.replace(SMOKE.airl, agent=agent, discriminator=quick, cloning_updates=0)
+    shown = transitions_of(problem.demonstrations)[0]
+    # Where no policy ever is.
+    far = shown._replace(obs_t=shown.obs_t + 30.0, next_obs_t=shown.next_obs_t + 30.0)
+
+    @jax.jit
+    def preference(key):
+        state = airl.init(key, problem.env, far, config)
+        after, _ = airl.train(state, problem.env, far, config, 5)
+
+        def prefers(params):
+            f = [discriminator.advantage(params, rows, quick) for rows in (far, shown)]
+            return jnp.mean(f[0]) - jnp.mean(f[1])
+
+        return prefers(state.discriminator.params), prefers(after.discriminator.params)
+
+    before, after = preference(jax.random.PRNGKey(0))
+    assert after > before + 0.1 and after > 0.0
 
 
 @pytest.mark.parametrize("agent", ["sac", "ppo"])

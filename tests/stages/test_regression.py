@@ -87,6 +87,75 @@ def test_discrimination_pushes_only_the_other_strategies_down():
     assert float(grads[0, 1]) > 0.0 and float(grads[1, 0]) > 0.0
 
 
+def _linear(seed):
+    """Linear heads of two strategies that see three entries, and what Eq. 2 is computed from."""
+    config = dataclasses.replace(
+        CONFIG,
+        hidden_sizes=(),
+        l2=0.3,
+        strategy_l2=0.2,
+        lambda_ssrr=0.7,
+        lambda_reg=0.5,
+        lambda_bcd=0.4,
+        strategy_weight=0.6,
+        return_scale=10.0,
+    )
+    random = np.random.default_rng(seed)
+    rewards = decomposition.draw(*jax.random.split(jax.random.PRNGKey(seed)), 3, 1, 2, config)
+    rewards = jax.tree.map(lambda x: jnp.asarray(random.normal(size=x.shape[1:])), rewards)
+    snippets = regression.Snippets(
+        inputs=jnp.asarray(random.normal(size=(2, 5, 4, 3))),
+        share=jnp.asarray(random.uniform(size=(2, 5))),
+        target=jnp.asarray(random.uniform(size=(2, 5))),
+    )
+    return config, rewards, snippets, jnp.asarray(random.normal(size=(2, 7, 3)))
+
+
+def test_the_loss_is_eq_2():
+    config, rewards, snippets, shown = _linear(0)
+    log_units = jnp.array([0.03, -0.03])
+    task, own = (jax.tree.map(np.asarray, one["params"]["Dense_0"]) for one in rewards[:2])
+    unit = 40 / 10.0
+
+    def rho_task(states):
+        return unit * (states @ task["kernel"][:, 0] + task["bias"])
+
+    def rho_own(i, states):
+        return unit * (states @ own["kernel"][i, :, 0] + own["bias"][i])
+
+    ssrr, reg = [], 0.0
+    utility = np.zeros((2, 2))
+    units = np.asarray(regression.units_of(log_units))
+    for i in range(2):
+        rho = (rho_task(snippets.inputs[i]) + 0.6 * rho_own(i, snippets.inputs[i])) / units[i]
+        errors = [np.mean(half, axis=1) - snippets.target[i] for half in (rho[:, :2], rho[:, 2:])]
+        ssrr.append(np.mean(np.prod(errors, axis=0) * np.square(10.0 * snippets.share[i])))
+        reg += np.mean(np.square(rho_own(i, snippets.inputs[i])))
+        for m in range(2):
+            reg += 0.5 * np.mean(np.square(rho_own(i, shown[m])))  # Of all demonstrated states.
+            utility[i, m] = np.mean(rho_task(shown[m]) + 0.6 * rho_own(i, shown[m]))
+    bcd = regression.discrimination_loss(jnp.asarray(utility), config)
+    l2 = 0.3 * np.square(task["kernel"]).sum() + 0.2 * np.square(own["kernel"]).sum()
+    total, metrics = regression.loss(rewards, log_units, snippets, shown, 40, config)
+    for name, expected in (
+        ("ssrr_loss", np.mean(ssrr)),
+        ("reg_loss", reg),
+        ("bcd_loss", bcd),
+        ("l2_loss", l2),
+    ):
+        np.testing.assert_allclose(metrics[name], expected, rtol=1e-4, err_msg=name)
+    expected = 0.7 * np.sum(ssrr) + 0.5 * reg + 0.4 * bcd + l2
+    np.testing.assert_allclose(total, expected, rtol=1e-4)
+
+
+def test_discrimination_and_the_penalty_of_strategies_leave_the_task_alone():
+    config, rewards, snippets, shown = _linear(1)
+    config = dataclasses.replace(config, lambda_ssrr=0.0, l2=0.0)
+    grads = jax.grad(lambda r: regression.loss(r, None, snippets, shown, 40, config)[0])(rewards)
+    assert all(not np.any(leaf) for leaf in jax.tree.leaves(grads.task))
+    assert any(np.any(leaf) for leaf in jax.tree.leaves(grads.strategies))
+
+
 def test_known_reward_is_recovered_and_decomposed():
     """Two strategies in different places; the curve knows a shared feature, x, and nothing else."""
     key = jax.random.PRNGKey(0)

@@ -63,6 +63,16 @@ def test_keys_not_heard_of_are_released():
     assert keys.take(2.0) == frozenset()
 
 
+def test_silence_is_since_anything_was_heard():
+    keys = HeldKeys()
+    assert keys.silence(7.0) == float("inf")
+    keys.update(["w"], 7.0)
+    keys.release()
+    assert keys.silence(9.5) == 2.5
+    keys.hear(9.5)
+    assert keys.silence(10.0) == 0.5 and keys.take(10.0) == frozenset()
+
+
 def test_released_keys_are_forgotten_even_if_no_step_took_them():
     keys = HeldKeys()
     keys.update(["w"], 0.0)

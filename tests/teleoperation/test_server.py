@@ -20,7 +20,7 @@ aiohttp = pytest.importorskip("aiohttp", reason="needs the extra 'teleop'")
 
 from aiohttp import test_utils  # noqa: E402
 
-from represent_jax.teleoperation import server  # noqa: E402
+from represent_jax.teleoperation import live, server  # noqa: E402
 
 SECONDS = 20.0
 
@@ -163,9 +163,39 @@ def test_a_dropped_connection_releases_the_keys_and_pauses(serve):
     asyncio.run(scenario())
 
 
+def test_an_episode_does_not_go_on_without_a_driver_who_has_fallen_silent(serve, monkeypatch):
+    monkeypatch.setattr(live, "_GONE_SECONDS", 1.0)
+
+    async def scenario():
+        async with serve() as client, page(client) as driver:
+            await driver.send("start")
+            for _ in range(15):
+                await driver.send("keys", held=[])
+                await asyncio.sleep(0.1)
+            assert client.session_under_test.phase is Phase.DRIVING
+            await driver.until_phase("paused")
+            assert "fallen silent" in driver.heard["status"]["notice"]
+
+    asyncio.run(scenario())
+
+
+def test_figures_are_told_often_however_few_pictures_are_wanted(lasting_env, tmp_path):
+    session = Session(lasting_env, tmp_path / "mine.npz", horizon=3)
+    app = server.make_app(session, Painter(lasting_env.engine.model, (96, 64)), "localhost", 0.01)
+
+    async def scenario():
+        async with test_utils.TestClient(test_utils.TestServer(app)) as client:
+            async with page(client) as driver:
+                await driver.until_phase("ready")
+                await driver.send("start")
+                await driver.until_phase("over")
+
+    asyncio.run(scenario())
+
+
 def test_pictures_are_sent_and_the_view_turns(serve):
     try:
-        offscreen.gl_context(64, 64).free()
+        offscreen.check_available()
     except RepresentError as error:
         pytest.skip(str(error))
 
@@ -238,6 +268,12 @@ def test_a_port_that_is_taken_is_refused(env, tmp_path):
                 await server._serve(session, painter, "127.0.0.1", other.port, 20.0, print)
 
     asyncio.run(scenario())
+
+
+def test_an_address_that_is_not_of_this_machine_is_named(env, tmp_path):
+    session, painter = Session(env, tmp_path / "a.npz"), Painter(env.engine.model, (96, 64))
+    with pytest.raises(UsageError, match="host: expected an address of this machine, found 'no"):
+        server.serve(session, painter, "no.such.host.invalid", 0)
 
 
 async def _save_one(address):

@@ -134,6 +134,7 @@ def test_a_recorded_episode_is_played_as_it_was(env, session):
     session.save(1)
     again = Session(env, session.path)
     again.play(1)
+    assert again.figures()["playing"] == 1
     for expected in positions[:-1]:
         np.testing.assert_allclose(again.qpos, expected, atol=1e-6)
         again.step(frozenset())
@@ -170,10 +171,11 @@ def test_demonstrations_from_elsewhere_are_kept_but_cannot_be_played(env, sessio
     again = Session(env, session.path)
     with pytest.raises(UsageError, match="episode 1 was not recorded here"):
         again.play(1)
-    drive(again, LEFT)
-    again.save(1)
+    for _ in range(2):
+        drive(again, LEFT)
+        again.save(1)
     demonstrations = load_demonstrations(session.path)
-    assert demonstrations.metadata["source"] == "elsewhere"
+    assert demonstrations.metadata["source"] == "elsewhere + teleoperation"
     seeds = recordings.reset_seeds(demonstrations)
     assert seeds[0] is None
     assert isinstance(seeds[1], int)
@@ -224,6 +226,7 @@ def test_without_keys_a_robot_is_watched(tmp_path):
 
 def test_a_policy_drives_in_place_of_keys(env, tmp_path):
     session = Session(env, tmp_path / "none.npz", policy=lambda obs: -np.ones(1))
+    assert session.watched and session.keyboard is None
     before = session.qpos[0]
     drive(session, RIGHT)
     assert session.qpos[0] < before - 0.1

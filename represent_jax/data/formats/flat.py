@@ -78,7 +78,12 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[list[Trajectory], lis
         )
     known = {name: key for name in NAMES if (key := _find(arrays, name))}
     if "observations" not in known:
-        raise RepresentError(f"no observations, it has {', '.join(sorted(arrays)) or 'nothing'}")
+        held = sorted(arrays)
+        shown = ", ".join(held[:20]) + (", ..." if len(held) > 20 else "")
+        raise RepresentError(
+            f"no observations: expected {' or '.join(NAMES['observations'])}, found "
+            f"{shown or 'nothing'}"
+        )
     unused = sorted(set(arrays) - set(known.values()))
     notes = [f"left out: {', '.join(unused)}"] if unused else []
     found = {name: np.asarray(arrays[key]) for name, key in known.items()}

@@ -120,7 +120,8 @@ def _require_vectors(what: str, space: gym.Space) -> None:
         keys = f" of {', '.join(space.spaces)}" if isinstance(space, gym.spaces.Dict) else ""
         raise RepresentError(
             f"{what} are a {type(space).__name__}{keys} of shape {space.shape}, "
-            "expected a Box of one axis"
+            "expected a Box of one axis; save what of it rewards are to see as arrays, which "
+            "--from=arrays reads"
         )
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from represent_jax.data import npz
 from represent_jax.data.catalogue import load_demonstrations
 from represent_jax.data.formats import arrays, d4rl, imitation, minari
-from represent_jax.data.trajectories import Demonstrations
+from represent_jax.data.trajectories import SOURCES, Demonstrations
 from represent_jax.errors import RepresentError, UsageError, unknown
 
 _OPTIONAL = ("actions", "rewards")
@@ -93,10 +93,12 @@ def read(
             dataclasses.replace(t, strategy=t.strategy + before) for t in held.trajectories
         ]
         before += held.num_strategies
+    sources = dict.fromkeys(held.metadata.get("source", "unknown") for held in every)
     metadata = {
+        "source": SOURCES.join(sources),
         "inputs": [
             {"input": str(name), **held.metadata} for name, held in zip(inputs, every, strict=True)
-        ]
+        ],
     }
     return Demonstrations(every[0].env_name, tuple(trajectories), metadata)
 

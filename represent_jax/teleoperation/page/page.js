@@ -1,6 +1,7 @@
 // The page of `represent_jax.teleoperation`: shows what the server tells, tells it what is pressed.
 
-const TOLD_AGAIN_MS = 250; // The server releases keys that it has not heard of for a second.
+// The server releases keys that it has not heard of for a second, and pauses after three.
+const TOLD_AGAIN_MS = 250;
 const RECONNECT_MS = 1000;
 const DEGREES_PER_PIXEL = 0.35;
 const CLOSER_PER_WHEEL = 0.0015;
@@ -16,6 +17,7 @@ const PRIMARY = {
   ready: ["Start", "start"], driving: ["Pause", "pause"], paused: ["Resume", "resume"],
   over: ["Start", ""], playing: ["Stop", "stop"],
 };
+const AGAIN = ["Again", "discard"];
 
 const $ = (id) => document.getElementById(id);
 const down = new Map(); // Name of each key that is held, by its place on the keyboard.
@@ -69,9 +71,12 @@ function hear(message) {
     item.append(cap, does);
     return item;
   }));
+  const watching = hello.watched
+    ? "A policy drives, and nothing is recorded."
+    : "No keys drive this robot: it can only be watched, and nothing is recorded.";
   $("keys-note").textContent = canDrive
     ? "Enter starts, pauses and resumes. Drag the picture to turn the view, scroll to zoom."
-    : "No keys drive this robot: it can only be watched, and nothing is recorded.";
+    : watching;
   $("camera-label").hidden = hello.cameras.length < 2;
   $("camera").replaceChildren(...hello.cameras.map((name, i) => new Option(name, i)));
   if (hello.no_pictures) {
@@ -98,6 +103,9 @@ function hearStatus(message) {
   showFigures();
   showControls();
   if (recordedShown !== status.num_recorded) showRecorded(status.num_recorded);
+  for (const row of $("recorded").rows) {
+    row.classList.toggle("playing", Number(row.dataset.episode) === status.playing);
+  }
 }
 
 function hearProblem(message) {
@@ -157,12 +165,14 @@ function capital(text) {
 function showControls() {
   const phase = status?.phase ?? "";
   const canDrive = Object.keys(hello.keys).length > 0;
-  const [label, command] = PRIMARY[phase] ?? ["Start", ""];
+  const again = phase === "over" && !canDrive; // There is nothing to save first.
+  const [label, command] = again ? AGAIN : (PRIMARY[phase] ?? ["Start", ""]);
   const unfinished = ["driving", "paused", "over"].includes(phase);
   $("phase").textContent =
     phase === "driving" && !canDrive ? "watching" : (PHASES[phase] ?? "not connected");
   $("phase").className = `phase ${phase}`;
   $("primary").textContent = label;
+  $("primary").dataset.command = command;
   $("primary").disabled = !role.drives || !command;
   $("save").disabled = !(role.drives && canDrive && unfinished && status.step > 0);
   $("discard").disabled = !(role.drives && unfinished);
@@ -192,6 +202,7 @@ async function showRecorded(num) {
   $("recorded").replaceChildren(...episodes.map((episode, i) => {
     perStrategy.set(episode.strategy, (perStrategy.get(episode.strategy) ?? 0) + 1);
     const row = document.createElement("tr");
+    row.dataset.episode = i + 1;
     const cells = [i + 1, episode.strategy, episode.steps, number(episode.return)];
     for (const text of cells) row.insertCell().textContent = text;
     const play = document.createElement("button");
@@ -254,9 +265,9 @@ document.addEventListener("visibilitychange", () => {
   release();
   if (role.drives && status?.phase === "driving") send({ do: "pause" });
 });
-setInterval(() => down.size && tellKeys(), TOLD_AGAIN_MS);
+setInterval(() => (down.size || status?.phase === "driving") && tellKeys(), TOLD_AGAIN_MS);
 
-$("primary").onclick = () => command({ do: PRIMARY[status.phase][1] });
+$("primary").onclick = (event) => command({ do: event.currentTarget.dataset.command });
 $("save").onclick = () => command({ do: "save", strategy: Number($("strategy").value) });
 $("discard").onclick = () => command({ do: "discard" });
 $("drive").onclick = () => command({ do: "drive" });
