@@ -215,12 +215,14 @@ class Problem(NamedTuple):
       demonstrations: of the strategies in use.
       lessons: these without their pauses, which is what methods learn from.
       test: unseen trajectories, with true rewards; only evaluation looks at them. May be none.
+      num_cut: how many demonstrations went on beyond the horizon, and end there.
     """
 
     env: Episode
     demonstrations: Demonstrations
     lessons: Demonstrations
     test: tuple[Trajectory, ...]
+    num_cut: int = 0
 
 
 def make_problem(
@@ -247,7 +249,9 @@ def make_problem(
             raise RepresentError(f"{what} are of {data.env_name}, expected {env.name}")
         data.check_against(env.observation_size, env.action_size, -1.0, 1.0)
         if config.needs_actions and not data.has_actions:
-            raise UsageError(f"{what} hold no actions, which {config.needs_actions} needs")
+            needs = config.needs_actions
+            way_out = "; without them, override that setting" if "=" in needs else ""
+            raise UsageError(f"{what} hold no actions, which {needs} needs{way_out}")
     if test is not None and not test.has_rewards:
         raise UsageError("test trajectories hold no true rewards, which are all they are for")
     if config.num_strategies > demonstrations.num_strategies:
@@ -263,6 +267,7 @@ def make_problem(
             for t in own
             if config.grouping in ("merged", names[t.strategy])
         ]
+    num_cut = sum(t.length > horizon for t in own)
     own = [_truncate(t, horizon) for t in own]
     moving = [without_pauses(t, config.least_change) for t in own]
     return Problem(
@@ -270,6 +275,7 @@ def make_problem(
         dataclasses.replace(demonstrations, trajectories=tuple(own)),
         dataclasses.replace(demonstrations, trajectories=tuple(moving)),
         tuple(_truncate(t, horizon) for t in test.trajectories) if test is not None else (),
+        num_cut,
     )
 
 

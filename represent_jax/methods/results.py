@@ -68,6 +68,7 @@ def describe(config: MethodConfig, problem: Problem) -> dict[str, Any]:
         ],
         "horizon": horizon,
         "cut_short": len(cut_short),
+        "cut_off": problem.num_cut,
         "source": demonstrations.metadata.get("source"),
         "missing": [what for what, there in given.items() if not there],
         **provenance(),

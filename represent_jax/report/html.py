@@ -136,7 +136,7 @@ def _notices(results: Mapping[str, Any]) -> str:
             "and strategy reward may share what was learned in any way."
         )
     notices += _source(results)
-    notices += tables.cut_short(results)
+    notices += tables.lengths(results)
     notices += tables.missing(results)
     return "".join(f"<p class=notice>{text(notice)}</p>" for notice in notices)
 

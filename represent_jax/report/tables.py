@@ -40,16 +40,26 @@ def missing(results: Mapping[str, Any]) -> list[str]:
     return [text for what, text in _MISSING.items() if what in (results.get("missing") or ())]
 
 
-def cut_short(results: Mapping[str, Any]) -> list[str]:
-    """Returns a sentence where demonstrations stop early though nothing ended them."""
-    num = results.get("cut_short", 0)
-    if not num:
-        return []
-    return [
-        f"{num} of {sum(one['num'] for one in results['demonstrators'])} demonstrations stop "
-        f"before the horizon of {results['horizon']} steps though nothing ended them: their "
-        "returns are of fewer steps than those of the policies beside them."
-    ]
+def lengths(results: Mapping[str, Any]) -> list[str]:
+    """Returns what there is to say of demonstrations whose length is not that of an episode."""
+    said, short, cut = [], results.get("cut_short", 0), results.get("cut_off", 0)
+    if short:
+        said.append(
+            f"{short} of {_num_demonstrations(results)} demonstrations stop before the horizon of "
+            f"{results['horizon']} steps though nothing ended them: their returns are of fewer "
+            "steps than those of the policies beside them."
+        )
+    if cut:
+        said.append(
+            f"{cut} of {_num_demonstrations(results)} demonstrations go on beyond the horizon of "
+            f"{results['horizon']} steps, and were cut there: nothing was learned from what they "
+            "came to later. The setting `horizon` makes episodes longer."
+        )
+    return said
+
+
+def _num_demonstrations(results: Mapping[str, Any]) -> int:
+    return sum(one["num"] for one in results["demonstrators"])
 
 
 def targets(results: Mapping[str, Any]) -> list[str]:

@@ -95,10 +95,12 @@ def test_one_strategy_alone_is_said_to_decompose_nothing(run_path, results):
 def test_demonstrations_that_stop_early_are_said_to(run_path, results):
     assert "though nothing ended them" not in read(write_report(run_path))[0]
     demonstrators = [{"name": f"strategy_{i}", "return_mean": 1.0, "num": 3} for i in (1, 2)]
-    short = {"horizon": 50, "cut_short": 2, "demonstrators": demonstrators}
-    assert tables.cut_short(results | short) == [
+    short = {"horizon": 50, "cut_short": 2, "cut_off": 1, "demonstrators": demonstrators}
+    assert tables.lengths(results | short) == [
         "2 of 6 demonstrations stop before the horizon of 50 steps though nothing ended them: "
-        "their returns are of fewer steps than those of the policies beside them."
+        "their returns are of fewer steps than those of the policies beside them.",
+        "1 of 6 demonstrations go on beyond the horizon of 50 steps, and were cut there: nothing "
+        "was learned from what they came to later. The setting `horizon` makes episodes longer.",
     ]
 
 
