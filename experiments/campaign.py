@@ -17,6 +17,7 @@ from absl import flags
 from experiments import launch
 from represent_jax.campaign.entries import Entry, entries, record
 from represent_jax.campaign.variants import DOMAINS, TABLES
+from represent_jax.config import config_hash
 from represent_jax.errors import RepresentError, UsageError, unknown
 from represent_jax.report.values import format_duration
 from represent_jax.runs import provenance
@@ -69,6 +70,10 @@ def main(argv: list[str]) -> None:
     records = _RECORD.value or f"{_OUT.value}/records.jsonl"
     print(f"{len(every)} runs, {len(graph.nodes)} stages, {len(graph.left)} of them left")
     if _DRY_RUN.value:
+        for entry in every:
+            config = entry.config
+            run = f"{config.env} {entry.recipe.variant} seed {config.seed}"
+            print(f"settings {config_hash(config)} {run}")
         for node in graph.nodes:
             print(f"{'done' if graph.is_done(node) else 'left':5} {node.hash} {node.name}")
         _print_time(graph)

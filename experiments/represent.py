@@ -92,7 +92,7 @@ def _run(config: MethodConfig, out: str) -> None:
     if len(names) < len(stages):
         launch.refuse_beside(f"with --until={_UNTIL.value}", ("record", "videos", "open"))
     if _DRY_RUN.value:
-        print(f"{out}: {' -> '.join(names)}")
+        print(f"{out}: {' -> '.join(names)}; settings {configs.config_hash(config)}")
         return
     tracker = None
     if _WANDB.value:
