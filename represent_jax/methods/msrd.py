@@ -93,7 +93,7 @@ def train(
     state = advance(
         directory,
         "msrd",
-        jax.jit(init)(key),
+        lambda: jax.jit(init)(key),
         jax.jit(
             lambda state: msrd.train(state, problem.env, demonstrations, config, num_steps),
             donate_argnums=0,
@@ -102,6 +102,7 @@ def train(
         units_per_chunk=chunk_env_steps,
         checkpoint_seconds=checkpoint_seconds,
         describe=lambda m: "discriminator " + pipeline.numbers(m["discriminator_loss"]),
+        example=jax.eval_shape(init, key),
     )
     output = msrd.finish(state)
     directory.save_output("msrd", output)

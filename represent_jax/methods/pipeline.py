@@ -52,12 +52,13 @@ def run_airl(
     states = advance(
         directory,
         "airl",
-        population.init(init, key),
+        lambda: population.init(init, key),
         step,
         -(-config.airl.env_steps // chunk_env_steps),
         units_per_chunk=chunk_env_steps,
         checkpoint_seconds=checkpoint_seconds,
         describe=lambda m: "discriminator " + numbers(m["discriminator_loss"]),
+        example=population.example(init),
     )
     output = stack([airl.finish(state) for state in population.members(states)])
     directory.save_output("airl", output)

@@ -99,12 +99,13 @@ def run(
     states = advance(
         directory,
         "policies",
-        population.init(init, key),
+        lambda: population.init(init, key),
         step,
         -(-config.env_steps // chunk_env_steps),
         units_per_chunk=chunk_env_steps,
         checkpoint_seconds=checkpoint_seconds,
         describe=lambda m: "learned return " + numbers(m["learned_return"]),
+        example=population.example(init),
     )
     output = stack([policies.finish(state, config) for state in population.members(states)])
     directory.save_output("policies", output)

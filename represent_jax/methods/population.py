@@ -68,6 +68,15 @@ class Population:
         program = meshes.sharded(self.mesh, init_vmap, (0, 0), meshes.axis_of_leaves(axes, state))
         return jax.jit(program)(*meshes.place(self.mesh, (keys, stack(self.inputs)), 0))
 
+    def example(self, init: Callable[[jax.Array, Any], Any]) -> Any:
+        """Shapes and types of what `init` of the population returns, without computing it."""
+        state = jax.eval_shape(init, jax.random.PRNGKey(0), self.inputs[0])
+        if self.mode == "threads":
+            return [state] * len(self.inputs)
+        init_vmap = jax.vmap(init, out_axes=self._axes_of(state))
+        keys = jax.random.split(jax.random.PRNGKey(0), len(self.inputs))
+        return jax.eval_shape(init_vmap, keys, stack(self.inputs))
+
     def stepper(self, step: Callable[[Any, Any], tuple[Any, Any]]) -> Callable:
         """Makes `states -> (states, metrics)` of `step(state, inputs)`; states are donated.
 

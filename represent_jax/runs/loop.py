@@ -18,7 +18,7 @@ State = TypeVar("State")
 def advance(
     run: RunDirectory | None,
     stage: str,
-    state: State,
+    state: State | Callable[[], State],
     step_fn: Callable[[State], tuple[State, Mapping[str, Any]]],
     num_chunks: int,
     *,
@@ -26,19 +26,22 @@ def advance(
     unit: str = "env steps",
     checkpoint_seconds: float = 30.0,
     describe: Callable[[Mapping[str, Any]], str] | None = None,
+    example: State | None = None,
 ) -> State:
     """Calls `step_fn` until `num_chunks` chunks are done, those of an interrupted run counted in.
 
     Args:
         run: where progress, logs and checkpoints go; None keeps everything off the disk.
         stage: name of the stage.
-        state: the state to begin with where nothing was saved; `step_fn` may donate it.
+        state: the state to begin with where nothing was saved, or, with `example`, a function that
+            makes it, called only then; `step_fn` may donate it.
         step_fn: advances the state by one chunk and returns it with scalar or array metrics.
         num_chunks: number of chunks in all.
         units_per_chunk: number of units in a chunk; logs and checkpoints count units.
         unit: name of the units, in plural.
         checkpoint_seconds: least time between two checkpoints.
         describe: what to show of the metrics beside the progress; the first three scalars if None.
+        example: shapes and types of the state where `state` is a function.
 
     Returns:
         The state after the last chunk, which is left to the caller to save.
@@ -47,12 +50,14 @@ def advance(
         RepresentError: a metric with "loss" in its name is not finite (the last checkpoint stays),
             or a saved state does not fit `state`.
     """
-    units = 0
+    units, saved = 0, None
     if run is not None:
-        saved = run.load_progress(stage, state)
+        saved = run.load_progress(stage, state if example is None else example)
         if saved is not None:
             units, state = saved
         run.rewind_log(stage, units)
+    if saved is None and example is not None:
+        state = state()
     total = num_chunks * units_per_chunk
     saved_at = time.monotonic()
     with progress(stage, total, unit, initial=units) as bar:

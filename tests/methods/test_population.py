@@ -31,6 +31,8 @@ def _run(mode):
         return state, {"mean": jnp.mean(state.value)}
 
     states = population.init(init, jax.random.PRNGKey(0))
+    shapes = jax.tree.map(lambda x: (x.shape, x.dtype), states)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), population.example(init)) == shapes
     stepper = population.stepper(step)
     for _ in range(3):
         states, metrics = stepper(states)

@@ -82,6 +82,33 @@ def test_interrupted_loop_ends_in_the_same_state_and_log(tmp_path):
         assert len(calls) == NUM_CHUNKS - at + 1
 
 
+def test_what_is_costly_to_begin_with_is_made_only_where_nothing_was_saved(tmp_path):
+    made = []
+
+    def start():
+        made.append(1)
+        return initial()
+
+    def go_on(run, step_fn=step):
+        return runs.advance(
+            run,
+            "airl",
+            start,
+            step_fn,
+            NUM_CHUNKS,
+            checkpoint_seconds=0.0,
+            example=jax.eval_shape(initial),
+        )
+
+    expected = advance(None)
+    with runs.open_run(tmp_path / "run", CONFIG) as run, pytest.raises(KeyboardInterrupt):
+        go_on(run, stopping(at=3))
+    assert len(made) == 1
+    with runs.open_run(tmp_path / "run", CONFIG, resume=True) as run:
+        assert_same(go_on(run), expected)
+    assert len(made) == 1
+
+
 def test_steps_after_the_last_checkpoint_are_logged_once(tmp_path):
     with runs.open_run(tmp_path / "whole", CONFIG) as whole:
         expected = advance(whole)
