@@ -25,7 +25,9 @@ from represent_jax.runs.records import append_results
 from represent_jax.runs.tracking import WandbTracker
 
 _ENV = flags.DEFINE_string("env", "half_cheetah", "Environment.")
-_METHOD = flags.DEFINE_string("method", "represent", f"One of {', '.join(METHODS)}.")
+_METHOD = flags.DEFINE_string(
+    "method", "represent", f"One of {', '.join(METHODS)}, or module:NAME of your own."
+)
 _PRESET = flags.DEFINE_string("preset", "quick", "Settings to begin with: smoke, quick or paper.")
 _SEED = flags.DEFINE_integer("seed", 0, "Seed of everything after the demonstrations.")
 _NUM_SEEDS = flags.DEFINE_integer("num_seeds", 1, "Number of seeds, from --seed on, in turn.")

@@ -23,6 +23,9 @@ _PRESET = flags.DEFINE_string(
     "Of the records to take; paper_one_phase_1 where Phase 1 was shared.",
 )
 _FORMAT = flags.DEFINE_string("format", "text", f"One of {', '.join(formats.FORMATS)}.")
+_METHODS = flags.DEFINE_list(
+    "methods", [], "Of your own, recorded with `--record`, to show beside those of the table."
+)
 _UPDATE = flags.DEFINE_string(
     "update", None, "Markdown page whose tables are written anew; its comments say which."
 )
@@ -34,10 +37,10 @@ def main(argv: list[str]) -> None:
     if not records:
         raise UsageError(f"{_RECORDS.value}: no records there")
     if _UPDATE.value:
-        launch.refuse_beside("with --update", ("table", "preset", "format"))
+        launch.refuse_beside("with --update", ("table", "preset", "format", "methods"))
         _update(Path(_UPDATE.value), records)
         return
-    shown = [tables.make(name, records, _PRESET.value) for name in _TABLE.value]
+    shown = [tables.make(name, records, _PRESET.value, _METHODS.value) for name in _TABLE.value]
     print("\n\n".join(formats.render(_FORMAT.value, *one) for one in shown))
 
 

@@ -68,11 +68,18 @@ class Cell(NamedTuple):
 
 
 class Select:
-    """Records of one preset, by what they measured; of several of one run the newest counts."""
+    """Records of one preset, by what they measured; of several of one run the newest counts.
 
-    def __init__(self, records: Iterable[Mapping[str, Any]], preset: str):
+    Attributes:
+      preset: the preset.
+      beside: methods of one's own, to be shown beside those that tables have.
+    """
+
+    def __init__(
+        self, records: Iterable[Mapping[str, Any]], preset: str, beside: Sequence[str] = ()
+    ):
         """Sorts the records."""
-        self.preset = preset
+        self.preset, self.beside = preset, tuple(beside)
         self._values: dict[tuple[str, str, str, str], dict[int, float | None]] = {}
         self._hashes: dict[tuple[str, str, str, str], dict[int, str | None]] = {}
         for record in records:
@@ -116,7 +123,7 @@ def correlations(select: Select) -> list[Cell]:
     for domain in GYM_DOMAINS:
         for target in _TARGETS:
             methods = ["represent", "ssrr", "msrd"] + ["drex"] * (target == "task")
-            for method in methods:
+            for method in (*methods, *select.beside):
                 published = paper.CORRELATIONS.get((domain, target, method))
                 cells.append(select.cell(domain, target, method, "pearson_pooled", published))
                 cells.append(select.cell(domain, target, method, "pearson_test"))
@@ -132,7 +139,7 @@ def returns(select: Select) -> list[Cell]:
         for target in _TARGETS:
             cells.append(_demonstrated(select, domain, target))
             merged = ["drex", "bc", "bc_rnn"] if target == "task" else ["msrd"]
-            for method in ["represent", "ssrr", *merged]:
+            for method in ["represent", "ssrr", *merged, *select.beside]:
                 published = paper.RETURNS.get((domain, target, method))
                 cells.append(select.cell(domain, target, method, "return_best", published))
                 cells.append(select.cell(domain, target, method, "return_final"))
@@ -159,7 +166,7 @@ def kitchen(select: Select) -> list[Cell]:
     cells = []
     for domain, target in itertools.product(KITCHENS, _TARGETS):
         cells.append(_demonstrated(select, domain, target))
-        for method in ("represent", "ssrr", "msrd", "bc"):
+        for method in ("represent", "ssrr", "msrd", "bc", *select.beside):
             published = paper.KITCHEN.get((target, method))
             cells.append(select.cell(domain, target, method, "return_best", published))
             for quantity in ("return_final", *_OUTCOMES, "pearson_test"):
@@ -234,18 +241,31 @@ TABLES: dict[str, tuple[str, Callable[[Select], list[Cell]]]] = {
 }
 
 
-def make(name: str, records: Iterable[Mapping[str, Any]], preset: str) -> tuple[str, list[Cell]]:
+def make(
+    name: str, records: Iterable[Mapping[str, Any]], preset: str, beside: Sequence[str] = ()
+) -> tuple[str, list[Cell]]:
     """The cells of a table for which there are records, and the table's title.
 
+    Args:
+      name: of `TABLES`.
+      records: of any runs.
+      preset: those of this one count.
+      beside: methods of one's own, shown beside those of Tables I, II and IV.
+
     Raises:
-      UsageError: no table of that name.
+      UsageError: no table of that name, or no record of a method of one's own.
       RepresentError: no record belongs to the table.
     """
     if name not in TABLES:
         raise unknown("table", name, TABLES)
     title, cells_of = TABLES[name]
     records = list(records)
-    cells = [cell for cell in cells_of(Select(records, preset)) if cell.found is not None]
+    held = {record["method"] for record in records if record["preset"] == preset}
+    for method in beside:
+        if method not in held:
+            raise unknown(f"method among records of preset {preset!r}", method, held)
+    select = Select(records, preset, beside)
+    cells = [cell for cell in cells_of(select) if cell.found is not None]
     if not cells:
         held = ", ".join(dict.fromkeys(record["preset"] for record in records)) or "none"
         raise RepresentError(
@@ -262,7 +282,7 @@ def to_table(title: str, cells: Sequence[Cell]) -> Table:
         rows.append(
             (
                 _row_name(cell),
-                VARIANT_NAMES[cell.method],
+                VARIANT_NAMES.get(cell.method, cell.method),
                 _QUANTITY_NAMES[cell.quantity],
                 _plus_minus(found.mean, found.std, digits),
                 format_number(found.iqm, digits),
@@ -330,7 +350,7 @@ def _to_grid(
         note += "; in round brackets the paper's"
     return Table(
         title=f"{title}: {_QUANTITY_NAMES[quantity]}",
-        columns=("", *(VARIANT_NAMES[method] for method in methods)),
+        columns=("", *(VARIANT_NAMES.get(method, method) for method in methods)),
         rows=tuple(
             (name, *(row.get(method, "-") for method in methods)) for name, row in shown.items()
         ),

@@ -1,12 +1,13 @@
-"""Methods by name."""
+"""Methods by name, and by the place of one that nobody registered."""
 
 import dataclasses
+import importlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 
-from represent_jax.errors import unknown
+from represent_jax.errors import UsageError, unknown
 from represent_jax.methods import (
     cloning,
     drex,
@@ -107,15 +108,38 @@ METHODS: dict[str, Method] = {
 }
 
 
+def register_method(method: Method, name: str) -> None:
+    """Makes a method known by name.
+
+    Raises:
+      UsageError: the name is taken.
+    """
+    if name in METHODS:
+        raise UsageError(f"method {name!r} is already registered")
+    METHODS[name] = method
+
+
 def find_method(name: str) -> Method:
     """Finds a method.
+
+    Args:
+      name: of `METHODS`, or "module:NAME" of a `Method` that Python can import.
 
     Raises:
       UsageError: no method of that name.
     """
-    if name not in METHODS:
+    if name in METHODS:
+        return METHODS[name]
+    module, colon, attribute = name.partition(":")
+    if not colon:
         raise unknown("method", name, METHODS)
-    return METHODS[name]
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"method {name!r}: {error}") from error
+    if not isinstance(found, Method):
+        raise UsageError(f"method {name!r}: expected a methods.registry.Method, found {found!r}")
+    return found
 
 
 def setting_names() -> frozenset[str]:

@@ -6,6 +6,7 @@ ends
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 
@@ -16,7 +17,7 @@ from represent_jax.methods.plan import Stage
 from represent_jax.methods.policy_learning import Trained
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import airl, decomposition, policies
-from represent_jax.types import RewardFn
+from represent_jax.types import Params, RewardFn
 
 
 def plan(
@@ -80,8 +81,9 @@ def last_stages(
     config: RepresentConfig,
     problem: Problem,
     checkpoint_seconds: float,
-    views: Callable[[decomposition.Rewards], dict[str, decomposition.View]],
-    rewards_of: Callable[[decomposition.Rewards], dict[str, Callable[..., jax.Array]]],
+    views: Callable[[Any], dict[str, Params]],
+    rewards_of: Callable[[Any], dict[str, Callable[..., jax.Array]]],
+    reward_fn: RewardFn | None = None,
 ) -> tuple[Stage, ...]:
     """What follows a regression: its rewards judged, policies on them, and these judged.
 
@@ -91,8 +93,10 @@ def last_stages(
       checkpoint_seconds: least time between two checkpoints.
       views: from what the regression returned to its rewards, by target, as parameters.
       rewards_of: the same as functions `reward(obs_t, action_t, next_obs_t)`.
+      reward_fn: `reward_fn(one of views, obs_t, action_t, next_obs_t)`; that of a
+        `decomposition.View` if None.
     """
-    reward_fn = _reward_fn(config)
+    reward_fn = reward_fn or _reward_fn(config)
 
     def judge_rewards(key, directory, noisy, curves, rewards):
         groups = results.noisy_groups(config, noisy)
@@ -212,7 +216,7 @@ def _reward_fn(config: RepresentConfig) -> RewardFn:
 
 
 def _objectives(
-    config: RepresentConfig, env: Episode, views: dict[str, decomposition.View]
+    config: RepresentConfig, env: Episode, views: dict[str, Params]
 ) -> dict[str, policies.Objective]:
     scale = env.horizon / config.regression.return_scale
     return {

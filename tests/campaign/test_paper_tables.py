@@ -48,6 +48,17 @@ def test_records_of_settings_that_the_preset_no_longer_has_are_marked():
     assert not any(c.other_settings for c in tables.make("2", one, "quick_one_phase_1")[1])
 
 
+def test_a_method_of_ones_own_stands_beside_the_others():
+    records = [_record("task", "pearson_test", 0, 0.5, method=m) for m in ("ssrr", "mine:RIDGE")]
+    title, cells = tables.make("1", records, "quick", ["mine:RIDGE"])
+    assert [cell.method for cell in cells] == ["ssrr", "mine:RIDGE"]
+    (grid,) = tables.to_grids(title, cells)
+    assert grid.columns[1:] == ("SSRR", "mine:RIDGE")
+    assert [cell.method for cell in tables.make("1", records, "quick")[1]] == ["ssrr"]
+    with pytest.raises(UsageError, match="'mine:RIGDE': did you mean mine:RIDGE"):
+        tables.make("1", records, "quick", ["mine:RIGDE"])
+
+
 def test_imitation_is_shown_as_a_method_of_its_own():
     records = [_record("strategy_1", "airl_return", 0, 900.0)]
     records += [_record("strategy_1", "airl_pearson_test", 0, 0.5)]

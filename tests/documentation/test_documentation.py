@@ -9,6 +9,7 @@ import pytest
 import represent_jax as rj
 from represent_jax.campaign import embedded
 from represent_jax.envs import registry
+from represent_jax.methods import registry as methods
 from represent_jax.runs.records import read_records
 
 DOCS = blocks.ROOT / "docs"
@@ -40,8 +41,9 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def reader(monkeypatch, request):
-    """In the reader's folder; environments that a page registers are forgotten after it."""
+    """In the reader's folder; environments and methods of a page are forgotten after it."""
     monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
+    monkeypatch.setattr(methods, "METHODS", dict(methods.METHODS))
     if "folder" in request.fixturenames:
         monkeypatch.chdir(request.getfixturevalue("folder"))
 

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import types
 
 import jax
 import numpy as np
@@ -12,6 +13,20 @@ from launcher import ROOT, finish, launch, log_of, results_of
 import represent_jax as rj
 from represent_jax import runs
 from represent_jax.errors import RepresentError, UsageError
+from represent_jax.methods.registry import METHODS, find_method, register_method
+
+
+def test_a_method_is_found_by_its_place(monkeypatch):
+    module = types.ModuleType("my_methods")
+    module.MINE, module.number = METHODS["ssrr"], 3
+    monkeypatch.setitem(sys.modules, "my_methods", module)
+    assert find_method("my_methods:MINE") is METHODS["ssrr"]
+    with pytest.raises(UsageError, match=r"expected a methods\.registry\.Method, found 3"):
+        find_method("my_methods:number")
+    with pytest.raises(UsageError, match="has no attribute 'other'"):
+        find_method("my_methods:other")
+    with pytest.raises(UsageError, match="'ssrr' is already registered"):
+        register_method(METHODS["bc"], "ssrr")
 
 
 def test_represent_in_pure_xla(tmp_path):
