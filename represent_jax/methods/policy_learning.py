@@ -121,6 +121,8 @@ def select(
     reward_fn: RewardFn,
     trained: Trained,
     directory: RunDirectory,
+    task: policies.Objective | None = None,
+    floors: Sequence[float] | None = None,
 ) -> Trained:
     """Hands every objective its own policy or a better one of another's, see `stages.selection`.
 
@@ -133,14 +135,19 @@ def select(
       reward_fn: the reward whose parameters the objectives hold.
       trained: the policies, of the objectives in their order.
       directory: where the stage is saved, and restored from.
+      task, floors: R^0, and what of it a policy has to earn to be handed to each objective; without
+        them none has to earn anything.
     """
     if directory.is_done("selection"):
         example = _selected_like(trained.policies, len(objectives))
         selected = directory.load_output("selection", example)
     else:
         candidates = [trained.policy(i) for i in range(len(objectives))]
-        returns = learned_returns(key, env, objectives, candidates, config, reward_fn)
-        chosen = selection.choose(returns, jnp.asarray(margins))
+        judges = [*objectives, *([] if task is None else [task])]
+        returns = learned_returns(key, env, judges, candidates, config, reward_fn)
+        returns, of_task = returns[:, : len(objectives)], returns[:, -1]
+        floors = None if floors is None else jnp.asarray(floors)
+        chosen = selection.choose(returns, jnp.asarray(margins), of_task, floors)
         handed_on = jax.tree.map(lambda x: x[chosen], trained.policies)
         selected = Selected(handed_on, chosen, returns)
         directory.save_output("selection", selected)

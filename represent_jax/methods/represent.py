@@ -9,7 +9,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
+from represent_jax.agents import rollout as rollouts
+from represent_jax.data.trajectories import pad
 from represent_jax.envs import Environment, Episode
 from represent_jax.methods import pipeline, policy_learning, results
 from represent_jax.methods.config import Problem, RepresentConfig
@@ -128,6 +131,12 @@ def last_stages(
         margins = [
             chosen.task_margin if name == "task" else chosen.strategy_margin for name in objectives
         ]
+        task, floors = None, None
+        if chosen.task_floor:
+            view = views(rewards)["task"]
+            scale = problem.env.horizon / config.regression.return_scale
+            task = policies.make_objective(view, scale, problem.env, config.policies)
+            floors = _task_floors(config, problem, reward_fn, view)
         return policy_learning.select(
             key,
             config.policies,
@@ -137,6 +146,8 @@ def last_stages(
             reward_fn,
             trained,
             directory,
+            task,
+            floors,
         )
 
     def judge_policies(key, directory, rewards, trained):
@@ -224,6 +235,17 @@ def _objectives(
         for name, view in views.items()
         if name in config.policy_names
     }
+
+
+def _task_floors(
+    config: RepresentConfig, problem: Problem, reward_fn: RewardFn, task: Params
+) -> list[float]:
+    """What each target's demonstrators earn of R^0 on average; nothing is asked of the task's."""
+    earned = {"task": -float("inf")}
+    for i, name in enumerate(config.group_names):
+        batch = pad(problem.demonstrations.of_strategy(i), problem.env.horizon)
+        earned[name] = float(jnp.mean(rollouts.learned_returns(batch, reward_fn, task)))
+    return [earned[name] for name in config.policy_names]
 
 
 def _starts(

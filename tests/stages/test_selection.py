@@ -48,6 +48,22 @@ def test_what_is_not_finite_is_never_handed_to_others():
     assert chosen([jnp.nan, jnp.nan, 1.0], [1.0, 1.0, 1.0], [2.0, 0.5, 1.0])[1] == 1
 
 
+def test_no_strategy_is_handed_what_leaves_the_task_undone():
+    # The second strategy's own policy earns most of its reward, and next to nothing of the task's.
+    returns = jnp.array([[10.0, 9.0, 9.0], [9.0, 9.5, 8.0], [4.0, 7.0, 11.0]])
+    task_returns = returns[:, 0]
+
+    def with_floor(floor):
+        floors = jnp.array([-jnp.inf, floor, floor])
+        return jax.jit(choose)(returns, MARGINS, task_returns, floors).tolist()
+
+    assert jax.jit(choose)(returns, MARGINS).tolist() == [0, 1, 2]
+    assert with_floor(7.5) == [0, 1, 0]
+    assert with_floor(9.5) == [0, 0, 0]
+    # Where none does the task, each keeps its own.
+    assert with_floor(20.0) == [0, 1, 2]
+
+
 def test_a_negative_margin_is_refused():
     with pytest.raises(UsageError, match="strategy_margin: expected at least 0"):
         SelectionConfig(strategy_margin=-0.1)
