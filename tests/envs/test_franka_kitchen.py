@@ -132,6 +132,14 @@ def test_noise_is_the_sources_and_reaches_the_control():
     episode = Episode(env, horizon=2)
     state = jax.jit(episode.reset)(jax.random.PRNGKey(0))
     step = jax.jit(episode.step)
+    # The control starts from what is seen, noise and all.
+    physics, zero = state.pipeline_state, jnp.zeros(9)
+    from_seen, from_true = (
+        env.engine.step(physics, env.task.control(obs_t, zero, None, None)).qpos
+        for obs_t in (state.obs, env.task.observe(physics))
+    )
+    np.testing.assert_allclose(step(state, zero).pipeline_state.qpos, from_seen, atol=1e-6)
+    assert np.abs(from_seen - from_true).max() > 1e-5
     seen = []
     for _ in range(3):
         true = env.task.observe(state.pipeline_state)
@@ -207,7 +215,8 @@ def test_the_driver_reads_how_far_the_kettle_is_from_its_goal():
 
 @pytest.mark.parametrize("name", ["franka_kitchen", "franka_kitchen_hand"])
 @pytest.mark.parametrize(
-    ("keys", "axis", "sign"), [("w", 1, 1), ("s", 1, -1), ("a", 0, -1), ("d", 0, 1), ("q", 2, 1)]
+    ("keys", "axis", "sign"),
+    [("w", 1, 1), ("s", 1, -1), ("a", 0, -1), ("d", 0, 1), ("q", 2, 1), ("e", 2, -1)],
 )
 def test_keys_move_the_hand_and_only_that_way(keys, axis, sign, name):
     env = make_kitchen(name=name)
@@ -226,6 +235,40 @@ def test_keys_move_the_hand_and_only_that_way(keys, axis, sign, name):
     moved = hand(state) - start
     assert sign * moved[axis] == pytest.approx(0.15 * 0.8, rel=0.15)
     assert np.abs(np.delete(moved, axis)).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("keys", "axis", "turned"),
+    [
+        (["arrowup"], 0, 0.48),
+        (["arrowdown"], 0, -0.48),
+        (["x"], 1, 0.48),
+        (["z"], 1, -0.48),
+        (["arrowleft"], 2, 0.48),
+        (["arrowright"], 2, -0.48),
+        (["arrowleft", "shift"], 2, 0.12),
+    ],
+)
+def test_keys_turn_the_hand_where_it_is(keys, axis, turned):
+    env = make_kitchen()
+    model = env.engine.model
+    keyboard, data = env.task.keyboard(model), mujoco.MjData(model)
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(0))
+
+    def hand(state):
+        data.qpos[:] = state.pipeline_state.qpos
+        mujoco.mj_kinematics(model, data)
+        site = data.site("end_effector")
+        return site.xpos.copy(), site.xmat.reshape(3, 3).copy()
+
+    place, rotation = hand(state)
+    for _ in range(10):
+        state = step(state, keyboard.action(frozenset(keys), state.pipeline_state))
+    after, rotation_after = hand(state)
+    turn = np.asarray(arm.turn_between(rotation, rotation_after))
+    assert turn[axis] == pytest.approx(turned, rel=0.25)
+    assert np.abs(np.delete(turn, axis)).max() < 0.08
+    assert np.abs(after - place).max() < 0.015
 
 
 @pytest.mark.parametrize(
