@@ -1,10 +1,10 @@
 """Environments by name, and by the place of a class that nobody registered."""
 
-import importlib
 from collections.abc import Callable
 
 from brax.envs import base
 
+from represent_jax import places
 from represent_jax.config import require
 from represent_jax.envs import playground
 from represent_jax.envs.environment import Environment
@@ -84,11 +84,7 @@ def make_env(name: str, backend: str = "auto", **task_options) -> base.Env:
 
 def _imported(name: str) -> Callable[..., Task | playground.Adapted]:
     """Finds what makes the environment of a "module:name"."""
-    module, _, attribute = name.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise UsageError(f"environment {name!r}: {error}") from error
+    found = places.find("environment", name)
     if not callable(found):
         raise UsageError(
             f"environment {name!r}: expected a class of envs.Task, or a function that returns an "

@@ -1,12 +1,12 @@
 """Methods by name, and by the place of one that nobody registered."""
 
 import dataclasses
-import importlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 
+from represent_jax import places
 from represent_jax.errors import UsageError, unknown
 from represent_jax.methods import (
     cloning,
@@ -130,13 +130,9 @@ def find_method(name: str) -> Method:
     """
     if name in METHODS:
         return METHODS[name]
-    module, colon, attribute = name.partition(":")
-    if not colon:
+    if ":" not in name:
         raise unknown("method", name, METHODS)
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise UsageError(f"method {name!r}: {error}") from error
+    found = places.find("method", name)
     if not isinstance(found, Method):
         raise UsageError(f"method {name!r}: expected a methods.registry.Method, found {found!r}")
     return found

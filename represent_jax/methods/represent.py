@@ -133,10 +133,8 @@ def last_stages(
         ]
         task, floors = None, None
         if chosen.task_floor:
-            view = views(rewards)["task"]
-            scale = problem.env.horizon / config.regression.return_scale
-            task = policies.make_objective(view, scale, problem.env, config.policies)
-            floors = _task_floors(config, problem, reward_fn, view)
+            task = _objective(config, problem.env, views(rewards)["task"])
+            floors = _task_floors(config, problem, reward_fn, task.params)
         return policy_learning.select(
             key,
             config.policies,
@@ -229,12 +227,16 @@ def _reward_fn(config: RepresentConfig) -> RewardFn:
 def _objectives(
     config: RepresentConfig, env: Episode, views: dict[str, Params]
 ) -> dict[str, policies.Objective]:
-    scale = env.horizon / config.regression.return_scale
     return {
-        name: policies.make_objective(view, scale, env, config.policies)
+        name: _objective(config, env, view)
         for name, view in views.items()
         if name in config.policy_names
     }
+
+
+def _objective(config: RepresentConfig, env: Episode, view: Params) -> policies.Objective:
+    scale = env.horizon / config.regression.return_scale
+    return policies.make_objective(view, scale, env, config.policies)
 
 
 def _task_floors(

@@ -213,13 +213,8 @@ def test_the_driver_reads_how_far_the_kettle_is_from_its_goal():
     assert distance == pytest.approx(np.linalg.norm(state.obs[32:35] - KETTLE_GOAL), abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["franka_kitchen", "franka_kitchen_hand"])
-@pytest.mark.parametrize(
-    ("keys", "axis", "sign"),
-    [("w", 1, 1), ("s", 1, -1), ("a", 0, -1), ("d", 0, 1), ("q", 2, 1), ("e", 2, -1)],
-)
-def test_keys_move_the_hand_and_only_that_way(keys, axis, sign, name):
-    env = make_kitchen(name=name)
+def move_hand(env, keys):
+    """How far the hand goes, and how it turns, in ten steps of held keys from the start."""
     model = env.engine.model
     keyboard, data = env.task.keyboard(model), mujoco.MjData(model)
     step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(0))
@@ -227,12 +222,23 @@ def test_keys_move_the_hand_and_only_that_way(keys, axis, sign, name):
     def hand(state):
         data.qpos[:] = state.pipeline_state.qpos
         mujoco.mj_kinematics(model, data)
-        return data.site("end_effector").xpos.copy()
+        site = data.site("end_effector")
+        return site.xpos.copy(), site.xmat.reshape(3, 3).copy()
 
-    start = hand(state)
+    place, rotation = hand(state)
     for _ in range(10):
         state = step(state, keyboard.action(frozenset(keys), state.pipeline_state))
-    moved = hand(state) - start
+    place_after, rotation_after = hand(state)
+    return place_after - place, np.asarray(arm.turn_between(rotation, rotation_after))
+
+
+@pytest.mark.parametrize("name", ["franka_kitchen", "franka_kitchen_hand"])
+@pytest.mark.parametrize(
+    ("keys", "axis", "sign"),
+    [("w", 1, 1), ("s", 1, -1), ("a", 0, -1), ("d", 0, 1), ("q", 2, 1), ("e", 2, -1)],
+)
+def test_keys_move_the_hand_and_only_that_way(keys, axis, sign, name):
+    moved, _ = move_hand(make_kitchen(name=name), keys)
     assert sign * moved[axis] == pytest.approx(0.15 * 0.8, rel=0.15)
     assert np.abs(np.delete(moved, axis)).max() < 0.02
 
@@ -250,25 +256,10 @@ def test_keys_move_the_hand_and_only_that_way(keys, axis, sign, name):
     ],
 )
 def test_keys_turn_the_hand_where_it_is(keys, axis, turned):
-    env = make_kitchen()
-    model = env.engine.model
-    keyboard, data = env.task.keyboard(model), mujoco.MjData(model)
-    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(0))
-
-    def hand(state):
-        data.qpos[:] = state.pipeline_state.qpos
-        mujoco.mj_kinematics(model, data)
-        site = data.site("end_effector")
-        return site.xpos.copy(), site.xmat.reshape(3, 3).copy()
-
-    place, rotation = hand(state)
-    for _ in range(10):
-        state = step(state, keyboard.action(frozenset(keys), state.pipeline_state))
-    after, rotation_after = hand(state)
-    turn = np.asarray(arm.turn_between(rotation, rotation_after))
+    moved, turn = move_hand(make_kitchen(), keys)
     assert turn[axis] == pytest.approx(turned, rel=0.25)
     assert np.abs(np.delete(turn, axis)).max() < 0.08
-    assert np.abs(after - place).max() < 0.015
+    assert np.abs(moved).max() < 0.015
 
 
 @pytest.mark.parametrize(
