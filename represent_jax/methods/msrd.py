@@ -10,7 +10,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from represent_jax.config import require
+from represent_jax.config import require, require_entries
 from represent_jax.envs import Environment, Episode
 from represent_jax.methods import pipeline, results
 from represent_jax.methods.config import MethodConfig, Problem, strategy_names
@@ -37,6 +37,10 @@ class MsrdMethodConfig(MethodConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.grouping == "separate", "grouping", "'separate'", repr(self.grouping))
+
+    def check_against(self, obs_dim: int) -> None:
+        """Raises a UsageError where R^0 is to see entries that an observation does not have."""
+        require_entries(self.msrd.task_entries, obs_dim, "msrd.task_entries")
 
     @property
     def target_names(self) -> tuple[str, ...]:

@@ -104,7 +104,10 @@ _KITCHEN = (
     # tells its noise levels apart is how the hand is held, and that is no matter of the task. And
     # where the kettle is, not how it is turned: one that was turned as none was demonstrated would
     # count as lost.
-    f"regression.task_entries={','.join(map(str, KETTLE_ENTRIES[:3]))}",
+    *(
+        f"{stage}.task_entries={','.join(map(str, KETTLE_ENTRIES[:3]))}"
+        for stage in ("regression", "msrd")
+    ),
     # R~^i sees so much more than R^0 that by itself it would explain the curve and leave to R^0
     # what is left over: at 0.1 R^0 orders noise levels backwards.
     "regression.lambda_reg=5",

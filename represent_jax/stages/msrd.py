@@ -56,6 +56,8 @@ class MsrdConfig:
       log_prob_clip: bound on log pi_i in the logits.
       strategy_l2, task_l2: weights of the mean squared outputs of R~_i and of R^0.
       strategy_weight: alpha, for all strategies.
+      task_entries: entries of the next observation that R^0 sees, such as the objects that a task
+        is about; all if empty.
       reward_scale: factor on f_i where it rewards the generator.
       reward_clip: bound on f_i where it rewards the generator.
       policy_average_rate: share of the generator that enters the average handed on, after every
@@ -78,6 +80,7 @@ class MsrdConfig:
     strategy_l2: float = 0.64
     task_l2: float = 0.0064
     strategy_weight: float = 1.0
+    task_entries: tuple[int, ...] = later(())
     reward_scale: float = 0.5
     reward_clip: float = 10.0
     policy_average_rate: float = 0.005
@@ -93,6 +96,8 @@ class MsrdConfig:
             *("gradient_penalty", "strategy_l2", "task_l2"),
         ):
             require(getattr(self, field) >= 0, field, ">= 0", getattr(self, field))
+        entries = self.task_entries
+        require(all(entry >= 0 for entry in entries), "task_entries", "indices from 0", entries)
         rate = self.policy_average_rate
         require(0.0 < rate <= 1.0, "policy_average_rate", "in (0, 1]", rate)
         # A clone is fitted before there are statistics, which would then move under its feet.
@@ -217,15 +222,16 @@ def init_rewards(key: jax.Array, demonstrations: Transition, config: MsrdConfig)
       config: settings.
     """
     obs = demonstrations.obs_t
+    obs_dim = obs.shape[-1]
     module, task_optimizer, optimizer = _networks(config)
 
-    def draw(key):
-        return module.init(key, jnp.zeros(obs.shape[-1]))
+    def draw(key, input_dim=obs_dim):
+        return module.init(key, jnp.zeros(input_dim))
 
     key_task, key_own = jax.random.split(key)
     own = jax.vmap(jax.vmap(draw))(jax.random.split(key_own, (2, obs.shape[0])))
     rewards = MsrdRewards(
-        task=draw(key_task),
+        task=draw(key_task, len(config.task_entries) or obs_dim),
         strategies=jax.tree.map(lambda x: x[0], own),
         shaping=jax.tree.map(lambda x: x[1], own),
         mean=jnp.mean(obs, axis=(0, 1)),
@@ -236,16 +242,27 @@ def init_rewards(key: jax.Array, demonstrations: Transition, config: MsrdConfig)
     return RewardsState(rewards, task_optimizer.init(rewards.task), strategy_opt)
 
 
-def _apply(network: Params, rewards: MsrdRewards, obs: jax.Array, config: MsrdConfig) -> jax.Array:
+def _apply(
+    network: Params,
+    rewards: MsrdRewards,
+    obs: jax.Array,
+    config: MsrdConfig,
+    entries: tuple[int, ...] = (),
+) -> jax.Array:
     module, _, _ = _networks(config)
     inputs = jnp.clip((obs - rewards.mean) / rewards.std, -INPUT_CLIP, INPUT_CLIP)
-    return module.apply(network, inputs)[..., 0]
+    return module.apply(network, inputs[..., entries] if entries else inputs)[..., 0]
+
+
+def _task(rewards: MsrdRewards, obs: jax.Array, config: MsrdConfig) -> jax.Array:
+    """R^0, `[...]`."""
+    return _apply(rewards.task, rewards, obs, config, config.task_entries)
 
 
 def _parts(own: MsrdRewards, transition: Transition, config: MsrdConfig):
     """R^0 and R~ of one strategy's rewards, `[...]` each."""
     obs = transition.next_obs_t
-    return _apply(own.task, own, obs, config), _apply(own.strategies, own, obs, config)
+    return _task(own, obs, config), _apply(own.strategies, own, obs, config)
 
 
 def advantage(own: MsrdRewards, transition: Transition, config: MsrdConfig) -> jax.Array:
@@ -429,7 +446,7 @@ def reward(
 ) -> jax.Array:
     """R^0, or R^0 + alpha R~_i of one strategy counted from 0, of the next state, `[...]`."""
     del obs_t, action_t
-    task_t = _apply(rewards.task, rewards, next_obs_t, config)
+    task_t = _task(rewards, next_obs_t, config)
     if strategy is None:
         return task_t
     own = jax.tree.map(lambda leaf: leaf[strategy], rewards.strategies)

@@ -163,6 +163,28 @@ def test_task_reward_makes_one_step_along_the_gradients_of_all_strategies_and_up
     _assert_close(found.rewards.task, jax.tree.map(jnp.add, state.rewards.task, updates))
 
 
+def test_task_reward_sees_its_entries_and_strategies_see_all():
+    config = dataclasses.replace(CONFIG, task_entries=(1,))
+    shown = _transition(np.random.default_rng(1), (2, 64))
+    rewards = msrd.init_rewards(jax.random.PRNGKey(10), shown, config).rewards
+    obs = jnp.asarray(shown.obs_t[0])
+
+    def seen(strategy):
+        slopes = jax.grad(
+            lambda obs: jnp.sum(msrd.reward(rewards, None, None, obs, config, strategy))
+        )(obs)
+        return np.any(np.asarray(slopes) != 0.0, axis=0)
+
+    assert seen(None).tolist() == [False, True]
+    assert seen(0).tolist() == [True, True]
+    with pytest.raises(UsageError, match="task_entries"):
+        dataclasses.replace(CONFIG, task_entries=(-1,))
+    method = make_config("smoke", "half_cheetah", "msrd")
+    method = dataclasses.replace(method, msrd=dataclasses.replace(method.msrd, task_entries=(17,)))
+    with pytest.raises(UsageError, match=r"msrd.task_entries.*size 17.*\(17,\)"):
+        method.check_against(17)
+
+
 def test_shared_feature_goes_to_the_task_and_the_other_to_the_strategies():
     """Experts of both strategies are at x = 1; one is at y = 1, the other at y = -1."""
     config = dataclasses.replace(
