@@ -17,7 +17,7 @@ from represent_jax.runs import RunDirectory
 from represent_jax.stages import bc, bc_rnn
 from represent_jax.stages.bc import BcConfig
 from represent_jax.stages.bc_rnn import BcRnnConfig
-from represent_jax.types import Params, Transition
+from represent_jax.types import Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,8 +164,7 @@ def load_bc_policies(
     config: BcMethodConfig, env: Environment, directory: RunDirectory
 ) -> dict[str, Callable[[jax.Array], jax.Array]]:
     """The policy of a run, by its only target."""
-    obs, nothing = jnp.zeros((1, env.observation_size)), jnp.zeros(1)
-    rows = Transition(obs, jnp.zeros((1, env.action_size)), obs, nothing, nothing, nothing)
+    rows = pipeline.blank_transitions(env, 1)
     key = jax.random.PRNGKey(0)
     example = jax.eval_shape(lambda key: bc.finish(bc.init(key, rows, config.bc)), key)
     params = directory.load_output("bc", example)

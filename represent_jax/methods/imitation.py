@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from represent_jax.config import require
 from represent_jax.envs import Environment, Episode
@@ -18,7 +17,6 @@ from represent_jax.methods.plan import Stage
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import airl
 from represent_jax.stages.airl import AirlConfig
-from represent_jax.types import Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,8 +130,7 @@ def _member(stacked: Any, i: int) -> Any:
 def _load(
     config: NoisyAirlMethodConfig, env: Environment, directory: RunDirectory
 ) -> airl.AirlOutput:
-    obs, nothing = jnp.zeros((1, env.observation_size)), jnp.zeros(1)
-    rows = Transition(obs, jnp.zeros((1, env.action_size)), obs, nothing, nothing, nothing)
+    rows = pipeline.blank_transitions(env, 1)
     episode = Episode(env, config.horizon or env.horizon)
     one = jax.eval_shape(
         lambda key: airl.finish(airl.init(key, episode, rows, config.airl)), jax.random.PRNGKey(0)

@@ -8,7 +8,6 @@ import dataclasses
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 
 from represent_jax.config import require, require_entries
 from represent_jax.envs import Environment, Episode
@@ -20,7 +19,6 @@ from represent_jax.runs import RunDirectory
 from represent_jax.runs.loop import advance
 from represent_jax.stages import msrd
 from represent_jax.stages.msrd import MsrdConfig
-from represent_jax.types import Transition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,10 +143,7 @@ def load_policies(
 
 
 def _load(config: MsrdMethodConfig, env: Environment, directory: RunDirectory) -> msrd.MsrdOutput:
-    shape = (config.num_groups, 1)
-    obs, nothing = jnp.zeros((*shape, env.observation_size)), jnp.zeros(shape)
-    action = jnp.zeros((*shape, env.action_size))
-    rows = Transition(obs, action, obs, nothing, nothing, nothing)
+    rows = pipeline.blank_transitions(env, config.num_groups, 1)
     episode = Episode(env, config.horizon or env.horizon)
     example = jax.eval_shape(
         lambda key: msrd.finish(msrd.init(key, episode, rows, config.msrd)), jax.random.PRNGKey(0)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from represent_jax.data.trajectories import Demonstrations, Trajectory, TrajectoryBatch, pad
-from represent_jax.envs import Episode
+from represent_jax.envs import Environment, Episode
 from represent_jax.errors import RepresentError
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.population import Population, stack
@@ -352,6 +352,13 @@ def padded_demonstrations(problem: Problem) -> TrajectoryBatch:
 def chunk_of(env_steps: int, per_step: int) -> int:
     """Environment steps between two host round trips: a twentieth of the budget."""
     return max(1, env_steps // 20 // per_step) * per_step
+
+
+def blank_transitions(env: Environment, *shape: int) -> Transition:
+    """Transitions of zeros, `[*shape]`, for what asks stages for shapes alone."""
+    obs, nothing = jnp.zeros((*shape, env.observation_size)), jnp.zeros(shape)
+    action = jnp.zeros((*shape, env.action_size))
+    return Transition(obs, action, obs, nothing, nothing, nothing)
 
 
 def shape_like(leaf: Any, num_members: int) -> jax.ShapeDtypeStruct:
