@@ -40,6 +40,11 @@ def require_sizes(sizes: tuple[int, ...], field: str = "hidden_sizes") -> None:
     require(all(size >= 1 for size in sizes), field, "each at least 1", sizes)
 
 
+def require_indices(entries: tuple[int, ...], field: str) -> None:
+    """Raises a SettingError unless all can be entries of an observation, of whatever size."""
+    require(all(entry >= 0 for entry in entries), field, "indices from 0", entries)
+
+
 def require_entries(entries: tuple[int, ...], obs_dim: int, field: str) -> None:
     """Raises a SettingError unless an observation of this size has all the entries."""
     expected = f"indices of an observation of size {obs_dim}"

@@ -29,7 +29,7 @@ from flax import linen, struct
 
 from represent_jax.agents import cloning, replay, sac
 from represent_jax.agents.sac import PolicyParams, SacConfig
-from represent_jax.config import later, require
+from represent_jax.config import later, require, require_indices
 from represent_jax.envs.episode import Episode
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.discriminator import INPUT_CLIP, Rows, gradient_penalty, logits
@@ -96,8 +96,7 @@ class MsrdConfig:
             *("gradient_penalty", "strategy_l2", "task_l2"),
         ):
             require(getattr(self, field) >= 0, field, ">= 0", getattr(self, field))
-        entries = self.task_entries
-        require(all(entry >= 0 for entry in entries), "task_entries", "indices from 0", entries)
+        require_indices(self.task_entries, "task_entries")
         rate = self.policy_average_rate
         require(0.0 < rate <= 1.0, "policy_average_rate", "in (0, 1]", rate)
         # A clone is fitted before there are statistics, which would then move under its feet.

@@ -3,7 +3,7 @@
 import dataclasses
 import enum
 
-from represent_jax.config import later, require, require_sizes
+from represent_jax.config import later, require, require_indices, require_sizes
 
 
 class Discrimination(enum.StrEnum):
@@ -124,12 +124,7 @@ class RegressionConfig:
             "in (0, 1]",
             self.discrimination_ratio,
         )
-        require(
-            all(entry >= 0 for entry in self.task_entries),
-            "task_entries",
-            "indices from 0",
-            self.task_entries,
-        )
+        require_indices(self.task_entries, "task_entries")
         if self.input_quantile is not None:
             require(
                 0.5 < self.input_quantile <= 1.0,
