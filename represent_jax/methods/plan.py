@@ -35,7 +35,7 @@ class Stage:
       inputs: names of the stages whose outputs it is given, in order.
       settings: what the output depends on beside the problem, the seed and the inputs.
       reports: whether the output is a part of the run's results.
-      sees_pauses: whether it learns from whole demonstrations, `Problem.demonstrations`.
+      sees_pauses: whether it looks at whole demonstrations, `Problem.demonstrations`.
       before_rewards: whether rewards are learned from it, so that its seed is Phase 1's.
       revision: raised when the stage makes something else of the same settings, so that a campaign
         does not take what was made before for it.

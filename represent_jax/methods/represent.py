@@ -134,7 +134,7 @@ def last_stages(
         task, floors = None, None
         if chosen.task_floor:
             task = _objective(config, problem.env, views(rewards)["task"])
-            floors = _task_floors(config, problem, reward_fn, task.params)
+            floors = task_floors(config, problem, reward_fn, task.params)
         return policy_learning.select(
             key,
             config.policies,
@@ -163,8 +163,16 @@ def last_stages(
         settings["policy_targets"] = config.policy_names
     selection, handed_on = (), "policies"
     if config.selects:
-        inputs = ("regression", "policies")
-        selection = (Stage("selection", select, inputs, {"selection": config.selection}),)
+        selection = (
+            Stage(
+                "selection",
+                select,
+                ("regression", "policies"),
+                {"selection": config.selection},
+                # A floor is what whole demonstrations earn.
+                sees_pauses=config.selection.task_floor,
+            ),
+        )
         handed_on = "selection"
     return (
         Stage(
@@ -239,12 +247,15 @@ def _objective(config: RepresentConfig, env: Episode, view: Params) -> policies.
     return policies.make_objective(view, scale, env, config.policies)
 
 
-def _task_floors(
+def task_floors(
     config: RepresentConfig, problem: Problem, reward_fn: RewardFn, task: Params
 ) -> list[float]:
-    """What each target's demonstrators earn of R^0 on average; nothing is asked of the task's."""
+    """What the demonstrators behind each of `policy_names` earn of R^0 on average.
+
+    Nothing is asked of the task's own policy, so its floor is minus infinity.
+    """
     earned = {"task": -float("inf")}
-    for i, name in enumerate(config.group_names):
+    for i, name in enumerate(config.target_names[1:]):
         batch = pad(problem.demonstrations.of_strategy(i), problem.env.horizon)
         earned[name] = float(jnp.mean(rollouts.learned_returns(batch, reward_fn, task)))
     return [earned[name] for name in config.policy_names]

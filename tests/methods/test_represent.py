@@ -15,6 +15,7 @@ from launcher import ROOT, finish, launch, log_of, results_of
 
 import represent_jax as rj
 from represent_jax.errors import RepresentError, UsageError
+from represent_jax.methods import represent
 from represent_jax.methods.config import make_problem
 from represent_jax.methods.presets import make_config
 
@@ -104,6 +105,29 @@ def test_merged_demonstrations_are_those_of_one_strategy():
     counts = [len(shipped.of_strategy(i)) for i in range(2)]
     assert len(merged.trajectories) == sum(counts) and len(alone.trajectories) == counts[1]
     assert config.target_names == ("task",)
+
+
+@pytest.mark.parametrize(
+    ("grouping", "groups"),
+    [("separate", ({0}, {1})), ("merged", ({0, 1},)), ("strategy_2", ({1},))],
+)
+def test_floors_are_what_the_demonstrators_of_each_target_earn_of_the_task(grouping, groups):
+    config = dataclasses.replace(make_config("smoke", "half_cheetah"), grouping=grouping)
+    env = rj.make_env("half_cheetah", "mujoco")
+    shipped = rj.load_demonstrations("half_cheetah")
+    problem = make_problem(config, env, shipped, shipped)
+
+    def first_entry(params, obs_t, action_t, next_obs_t):
+        return next_obs_t[..., 0]
+
+    floors = represent.task_floors(config, problem, first_entry, ())
+    end = problem.env.horizon + 1
+    expected = [
+        np.mean([np.sum(t.obs[1:end, 0]) for t in shipped.trajectories if t.strategy in group])
+        for group in groups
+    ]
+    assert floors[0] == -np.inf
+    np.testing.assert_allclose(floors[1:], expected, rtol=1e-4)
 
 
 def test_evaluate_judges_a_finished_run(finished):
