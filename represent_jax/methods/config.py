@@ -7,6 +7,7 @@ from represent_jax.config import later, require
 from represent_jax.data.trajectories import Demonstrations, Trajectory, without_pauses
 from represent_jax.envs import Environment, Episode, registry
 from represent_jax.errors import RepresentError, UsageError, unknown
+from represent_jax.methods.population import MODES as POPULATION_MODES
 from represent_jax.stages import airl, decomposition, policies
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.curve import CurveConfig
@@ -61,8 +62,10 @@ class MethodConfig:
             self.grouping in groupings,
             "grouping",
             f"one of {', '.join(groupings)}",
-            repr(self.grouping),
+            self.grouping,
         )
+        modes = f"one of {', '.join(POPULATION_MODES)}"
+        require(self.population in POPULATION_MODES, "population", modes, self.population)
         require(self.seed >= 0, "seed", "at least 0", self.seed)
         require((self.phase_1_seed or 0) >= 0, "phase_1_seed", "at least 0", self.phase_1_seed)
         require(self.horizon >= 0, "horizon", "at least 0", self.horizon)
@@ -122,9 +125,7 @@ class OneGroupConfig(MethodConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.grouping != "separate", "grouping", "'merged' or one strategy", repr(self.grouping)
-        )
+        require(self.grouping != "separate", "grouping", "'merged' or one strategy", self.grouping)
 
 
 @dataclasses.dataclass(frozen=True)

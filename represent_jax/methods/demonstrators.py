@@ -31,6 +31,18 @@ from represent_jax.runs.loop import advance
 from represent_jax.stages import diayn
 from represent_jax.stages.diayn import DiaynConfig
 
+_LEAST = {
+    "env_steps": 1,
+    "test_env_steps": 1,
+    "snapshot_env_steps": 1,
+    # One to fit styles to, and one to judge them.
+    "trajectories_per_skill": 2,
+    "demonstration_horizon": 0,
+    "steadiness_weight": 0,
+    "test_snapshots": 2,
+    "test_trajectories_per_skill": 1,
+}
+
 
 @dataclasses.dataclass(frozen=True)
 class DemonstratorConfig:
@@ -87,8 +99,17 @@ class DemonstratorConfig:
             f"empty or an order of 0 to {self.diayn.num_skills - 1}",
             self.strategy_order,
         )
+        require(
+            all(self.target_returns),
+            "target_returns",
+            "none that is 0, since a skill is judged by its error as a share of it",
+            self.target_returns,
+        )
         require(self.seed != self.test_seed, "test_seed", "another than seed", self.test_seed)
-        require(self.test_snapshots >= 2, "test_snapshots", "at least 2", self.test_snapshots)
+        for field, least in _LEAST.items():
+            require(getattr(self, field) >= least, field, f"at least {least}", getattr(self, field))
+        share = self.min_skill_accuracy
+        require(0.0 <= share <= 1.0, "min_skill_accuracy", "in [0, 1]", share)
 
 
 _SAC = SacConfig(initial_temperature=0.1, learning_rate=1e-3)

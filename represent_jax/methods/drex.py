@@ -7,6 +7,7 @@ prefers less noise. Its policy is SAC's, as in the paper's Table II; D-REX's own
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +23,7 @@ from represent_jax.methods import cloning, pipeline, policy_learning, results
 from represent_jax.methods.config import OneGroupConfig, Problem, check_start
 from represent_jax.methods.plan import Stage
 from represent_jax.runs import RunDirectory
-from represent_jax.stages import bc, policies, preference
+from represent_jax.stages import bc, noise, policies, preference
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.bc import BcConfig
 from represent_jax.stages.noise import NoiseConfig, NoisyData
@@ -60,6 +61,10 @@ class DrexConfig(OneGroupConfig):
             self.policies.start,
         )
         check_start(self.airl, self.policies)
+        gap, highest = self.preference.min_level_gap, noise.highest_level(self.noise)
+        expected = f"at most the highest noise level ({highest:g})"
+        reached = gap <= highest or math.isclose(gap, highest)
+        require(reached, "preference.min_level_gap", expected, gap)
 
     @property
     def needs_actions(self) -> str:

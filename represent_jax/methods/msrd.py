@@ -34,7 +34,7 @@ class MsrdMethodConfig(MethodConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.grouping == "separate", "grouping", "'separate'", repr(self.grouping))
+        require(self.grouping == "separate", "grouping", "'separate'", self.grouping)
 
     def check_against(self, obs_dim: int) -> None:
         """Raises a UsageError where R^0 is to see entries that an observation does not have."""

@@ -70,7 +70,13 @@ class Operator:
     lapse_rate: float = 0.0
 
     def __post_init__(self) -> None:
-        require(self.strategy in STRATEGIES, "strategy", "push or hold", repr(self.strategy))
+        require(self.strategy in STRATEGIES, "strategy", "push or hold", self.strategy)
+        require(self.reaction_steps >= 0, "reaction_steps", "at least 0", self.reaction_steps)
+        require(self.decision_steps >= 1, "decision_steps", "at least 1", self.decision_steps)
+        for field in ("aim_error", "pause_steps", "think_steps"):
+            require(getattr(self, field) >= 0.0, field, "at least 0", getattr(self, field))
+        for field in ("pause_rate", "fast_share", "lapse_rate"):
+            require(0.0 <= getattr(self, field) <= 1.0, field, "in [0, 1]", getattr(self, field))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,9 +106,9 @@ class OperatorsConfig:
 
     def __post_init__(self) -> None:
         require(
-            1 <= self.demonstrations <= self.episodes,
+            2 <= self.demonstrations <= self.episodes,
             "demonstrations",
-            f"1 to {self.episodes}, the episodes driven",
+            f"2 (one to fit styles to, one to judge them) to {self.episodes}, the episodes driven",
             self.demonstrations,
         )
         require(

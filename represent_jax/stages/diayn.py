@@ -59,6 +59,8 @@ class DiaynConfig:
             f"at least num_skills ({self.num_skills})",
             self.sac.num_envs,
         )
+        weight = self.diversity_weight
+        require(weight >= 0.0, "diversity_weight", "at least 0", weight)
         require(
             self.diversity_floor < self.diversity_ceiling,
             "diversity_floor",

@@ -61,6 +61,8 @@ class DiscriminatorConfig:
         for field in ("gradient_penalty", "weight_decay"):
             require(getattr(self, field) >= 0.0, field, ">= 0", getattr(self, field))
         require_sizes(self.hidden_sizes)
+        discount = self.shaping_discount
+        require(0.0 <= discount <= 1.0, "shaping_discount", "in [0, 1]", discount)
         require(self.log_prob_clip > 0.0, "log_prob_clip", "positive", self.log_prob_clip)
 
 

@@ -29,7 +29,7 @@ from flax import linen, struct
 
 from represent_jax.agents import cloning, replay, sac
 from represent_jax.agents.sac import PolicyParams, SacConfig
-from represent_jax.config import later, require, require_indices
+from represent_jax.config import later, require, require_indices, require_sizes
 from represent_jax.envs.episode import Episode
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.discriminator import INPUT_CLIP, Rows, gradient_penalty, logits
@@ -89,13 +89,19 @@ class MsrdConfig:
     def __post_init__(self) -> None:
         for field in ("env_steps", "batch_size", "updates_per_step"):
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
-        for field in ("learning_rate", "task_learning_rate", "log_prob_clip", "reward_clip"):
+        for field in (
+            *("learning_rate", "task_learning_rate"),
+            *("log_prob_clip", "reward_scale", "reward_clip"),
+        ):
             require(getattr(self, field) > 0.0, field, "positive", getattr(self, field))
         for field in (
-            *("cloning_updates", "cloning_noise"),
-            *("gradient_penalty", "strategy_l2", "task_l2"),
+            *("cloning_updates", "cloning_noise", "weight_decay"),
+            *("gradient_penalty", "strategy_l2", "task_l2", "strategy_weight"),
         ):
             require(getattr(self, field) >= 0, field, ">= 0", getattr(self, field))
+        require_sizes(self.hidden_sizes)
+        discount = self.shaping_discount
+        require(0.0 <= discount <= 1.0, "shaping_discount", "in [0, 1]", discount)
         require_indices(self.task_entries, "task_entries")
         rate = self.policy_average_rate
         require(0.0 < rate <= 1.0, "policy_average_rate", "in (0, 1]", rate)

@@ -47,7 +47,7 @@ class NoiseConfig:
         )
         require(self.actions in ("mode", "sampled"), "actions", "'mode' or 'sampled'", self.actions)
         require(0.0 < self.action_size <= 1.0, "action_size", "in (0, 1]", self.action_size)
-        highest = self.level_step * (self.num_levels - 1)
+        highest = highest_level(self)
         require(0.0 < highest <= 1.0, "level_step", "highest level in (0, 1]", highest)
 
 
@@ -63,6 +63,11 @@ class NoisyData(NamedTuple):
     trajectories: TrajectoryBatch
     levels: jax.Array
     returns: jax.Array
+
+
+def highest_level(config: NoiseConfig) -> float:
+    """The highest noise level; the lowest is 0."""
+    return config.level_step * (config.num_levels - 1)
 
 
 def levels_of(config: NoiseConfig) -> jax.Array:

@@ -62,3 +62,12 @@ def test_bad_settings_are_named():
         DemonstratorConfig(target_returns=(1.0,))
     with pytest.raises(UsageError, match="test_seed"):
         DemonstratorConfig(seed=3, test_seed=3)
+    with pytest.raises(UsageError, match=r"target_returns.*none that is 0"):
+        DemonstratorConfig(target_returns=(0.0, 1.0, 2.0))
+    for field, value in (
+        *(("env_steps", 0), ("snapshot_env_steps", 0), ("demonstration_horizon", -1)),
+        *(("trajectories_per_skill", 1), ("test_trajectories_per_skill", 0)),
+        *(("test_snapshots", 1), ("min_skill_accuracy", 7.0)),
+    ):
+        with pytest.raises(UsageError, match=f"^{field}: expected"):
+            DemonstratorConfig(**{field: value})

@@ -1,6 +1,7 @@
 """Every method from demonstrations to what it returns, with tiny budgets."""
 
 import json
+import re
 import subprocess
 import sys
 import types
@@ -12,7 +13,9 @@ from launcher import ROOT, finish, launch, log_of, results_of
 
 import represent_jax as rj
 from represent_jax import runs
+from represent_jax.config import apply_overrides
 from represent_jax.errors import RepresentError, UsageError
+from represent_jax.methods.presets import make_config
 from represent_jax.methods.registry import METHODS, find_method, register_method
 
 
@@ -68,6 +71,25 @@ def test_a_policy_for_some_of_the_targets(tmp_path):
     assert rj.load_policy(out)(obs).shape == (3, 1)
     with pytest.raises(UsageError, match="task"):
         rj.load_policy(out, "strategy_1")
+
+
+@pytest.mark.parametrize(
+    ("method", "override", "message"),
+    [
+        (
+            "drex",
+            "preference.min_level_gap=0.99",
+            "highest noise level (0.95), found 0.99",
+        ),
+        ("drex", "grouping=separate", "expected 'merged' or one strategy, found 'separate'"),
+        ("msrd", "grouping=merged", "expected 'separate', found 'merged'"),
+        ("bc", "population=both", "expected one of auto, threads, vmap, found 'both'"),
+        ("represent", "grouping=all", "strategy_1, strategy_2, found 'all'"),
+    ],
+)
+def test_settings_that_no_stage_could_use_are_refused_at_once(method, override, message):
+    with pytest.raises(UsageError, match=f"^{override.split('=')[0]}: .*{re.escape(message)}$"):
+        apply_overrides(make_config("quick", "half_cheetah", method), [override])
 
 
 @pytest.mark.parametrize("method", ["drex", "msrd", "airl", "noisy_airl", "bc", "bc_rnn"])

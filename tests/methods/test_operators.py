@@ -57,9 +57,21 @@ def test_an_operator_pushes_the_kettle_through_the_keys(name):
     assert np.abs(trajectory.actions).max() <= 1.0
 
 
-def test_unknown_strategies_are_errors():
-    with pytest.raises(UsageError, match="strategy"):
-        Operator(strategy="pull")
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *(("strategy", "pull"), ("reaction_steps", -1), ("decision_steps", 0)),
+        *(("aim_error", -1.0), ("pause_rate", 2.0), ("lapse_rate", -0.1)),
+    ],
+)
+def test_operators_that_cannot_be_are_errors(field, value):
+    with pytest.raises(UsageError, match=f"^{field}: expected .*, found {value!r}$"):
+        Operator(**{field: value})
+
+
+def test_styles_are_judged_by_two_demonstrations_at_least():
+    with pytest.raises(UsageError, match=r"^demonstrations: expected 2 \("):
+        OperatorsConfig(demonstrations=1)
 
 
 @pytest.mark.parametrize(

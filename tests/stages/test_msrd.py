@@ -177,12 +177,22 @@ def test_task_reward_sees_its_entries_and_strategies_see_all():
 
     assert seen(None).tolist() == [False, True]
     assert seen(0).tolist() == [True, True]
-    with pytest.raises(UsageError, match="task_entries"):
-        dataclasses.replace(CONFIG, task_entries=(-1,))
     method = make_config("smoke", "half_cheetah", "msrd")
     method = dataclasses.replace(method, msrd=dataclasses.replace(method.msrd, task_entries=(17,)))
     with pytest.raises(UsageError, match=r"msrd.task_entries.*size 17.*\(17,\)"):
         method.check_against(17)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *(("task_entries", (-1,)), ("hidden_sizes", (0,)), ("reward_scale", 0.0)),
+        *(("weight_decay", -1.0), ("strategy_weight", -1.0), ("shaping_discount", 7.0)),
+    ],
+)
+def test_settings_that_cannot_be_are_named(field, value):
+    with pytest.raises(UsageError, match=f"^{field}: expected"):
+        dataclasses.replace(CONFIG, **{field: value})
 
 
 def test_shared_feature_goes_to_the_task_and_the_other_to_the_strategies():
