@@ -28,6 +28,7 @@ from represent_jax.agents import sac
 from represent_jax.config import config_hash, to_dict
 from represent_jax.envs import Environment, Episode, make_env
 from represent_jax.errors import UsageError, unknown
+from represent_jax.methods import transfer
 from represent_jax.physics.mjx import MjxEngine, MjxSolver
 from represent_jax.runs import append_record, provenance
 from represent_jax.types import Transition
@@ -42,13 +43,7 @@ _LOOP, _MUJOCO, _EPISODE, _MJX, _GYM = (
     "mjx, jit(scan)",
     "gymnasium.make_vec, sync",
 )
-_GYM_TASKS = {
-    "hopper": ("Hopper-v4", {"terminate_when_unhealthy": False}),
-    "half_cheetah": ("HalfCheetah-v4", {}),
-    "inverted_double_pendulum": ("InvertedDoublePendulum-v4", {}),
-}
-
-_ENVS = flags.DEFINE_list("envs", list(_GYM_TASKS), "Environments.")
+_ENVS = flags.DEFINE_list("envs", list(transfer.TASKS), "Environments.")
 _NUM_ENVS = flags.DEFINE_list("num_envs", ["64"], "Numbers of environments stepped together.")
 _SECTION = flags.DEFINE_list("sections", ["engines", "population"], "Among " + str(_SECTIONS))
 _SECONDS = flags.DEFINE_float("seconds", 1.0, "Least time of one measurement.", lower_bound=0.0)
@@ -128,7 +123,7 @@ def _engines() -> None:
         rows.append(_jitted(_EPISODE, Episode(env), num_envs, 100))
         if _MJX_ROW.value:
             rows.append(_jitted(_MJX, make_env(name, "mjx"), num_envs, 10))
-        if name in _GYM_TASKS:
+        if name in transfer.TASKS:
             try:
                 rows.append(_gymnasium(name, num_envs))
             except ImportError as error:
@@ -191,7 +186,7 @@ def _jitted(name: str, env: Environment | Episode, num_envs: int, num_steps: int
 
 def _gymnasium(name: str, num_envs: int) -> Row:
     num_steps = 20
-    gym_name, options = _GYM_TASKS[name]
+    gym_name, options = transfer.TASKS[name]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # -v4 is called outdated; it is the one with this reward
         mujoco.set_mju_user_warning(lambda message: None)  # one for each model compiled

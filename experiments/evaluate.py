@@ -28,7 +28,7 @@ _RUN = flags.DEFINE_string("run", None, "Run folder.", required=True)
 _TRAJECTORIES = flags.DEFINE_string(
     "trajectories",
     "",
-    "Name or npz file of trajectories; those that the run was judged on if empty.",
+    "Name or npz file of trajectories, judged whole; if empty those that the run was judged on.",
 )
 _EPISODES = flags.DEFINE_integer("episodes", 10, "Episodes of each policy.", lower_bound=1)
 _NOISE_LEVEL = flags.DEFINE_float(

@@ -69,7 +69,11 @@ def compile_quickly(preset: str) -> None:
 
 
 def overrides(values: Sequence[str]) -> list[str]:
-    """Refuses to override what a flag says, since other things follow from the flag."""
+    """Returns the overrides, none of which may say what a flag says: other things follow from it.
+
+    Raises:
+        UsageError: one does.
+    """
     for one in values:
         name = one.partition("=")[0]
         if name in ("method", "env", "preset", "seed"):
@@ -83,6 +87,9 @@ def refuse_beside(cause: str, names: Sequence[str]) -> None:
     Args:
         cause: why they would do nothing.
         names: of the flags.
+
+    Raises:
+        UsageError: one of them was given.
     """
     given = [f"--{name}" for name in names if flags.FLAGS[name].present]
     if given:
@@ -96,6 +103,10 @@ def open_page(page: Path) -> None:
 
 
 def refuse_arguments(argv: list[str]) -> None:
-    """Refuses words on the command line that are no flags."""
+    """Refuses words on the command line that are no flags.
+
+    Raises:
+        absl.app.UsageError: there are some.
+    """
     if len(argv) > 1:
         raise app.UsageError(f"unexpected arguments: {' '.join(argv[1:])}")

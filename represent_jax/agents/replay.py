@@ -32,7 +32,11 @@ def init(capacity: int, obs_dim: int, action_dim: int) -> ReplayBuffer:
 
 
 def insert(buffer: ReplayBuffer, transitions: Transition) -> ReplayBuffer:
-    """Writes a batch over the oldest rows; the capacity must be a multiple of the batch size."""
+    """Writes a batch over the oldest rows.
+
+    Raises:
+      ValueError: the capacity is not a multiple of the batch size.
+    """
     rows = _flatten(transitions)
     capacity, batch_size = buffer.data.shape[0], rows.shape[0]
     if capacity % batch_size:

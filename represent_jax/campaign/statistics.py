@@ -28,7 +28,11 @@ class Aggregate(NamedTuple):
 
 
 def aggregate(values: Sequence[float]) -> Aggregate:
-    """Aggregates one value a seed; the bootstrap's own seed is fixed."""
+    """Aggregates one value a seed; the bootstrap's own seed is fixed.
+
+    Raises:
+      ValueError: no values, or some that are not finite.
+    """
     x = np.asarray(values, float)
     if x.size == 0 or not np.isfinite(x).all():
         raise ValueError(f"values: expected finite numbers, at least one, found {values}")

@@ -27,6 +27,7 @@ from represent_jax.data.trajectories import (
 )
 from represent_jax.envs import Episode, make_env
 from represent_jax.errors import RepresentError
+from represent_jax.methods.population import member_of
 from represent_jax.runs.loop import advance
 from represent_jax.stages import diayn
 from represent_jax.stages.diayn import DiaynConfig
@@ -303,7 +304,7 @@ def choose_demonstrations(
     for strategy, target in enumerate(strategy_order or range(len(targets))):
         skill = order[target]
         snapshot = snapshots[int(np.argmin(cost[:, skill, target]))]
-        batch = jax.tree.map(lambda x, skill=skill: x[skill], snapshot.trajectories)
+        batch = member_of(snapshot.trajectories, skill)
         trajectories += unpad(batch._replace(strategy=np.full_like(batch.strategy, strategy)))
         env_steps.append(snapshot.env_steps)
     return trajectories, env_steps
@@ -325,7 +326,7 @@ def choose_test_set(
     for index in chosen:
         batch = jax.tree.map(lambda x: x[:, :per_skill], snapshots[index].trajectories)
         for skill in range(batch.mask.shape[0]):
-            one = jax.tree.map(lambda x, skill=skill: x[skill], batch)
+            one = member_of(batch, skill)
             trajectories += unpad(one._replace(strategy=np.full_like(one.strategy, skill)))
     return trajectories
 

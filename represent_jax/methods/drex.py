@@ -22,6 +22,7 @@ from represent_jax.envs import Environment
 from represent_jax.methods import cloning, pipeline, policy_learning, results
 from represent_jax.methods.config import OneGroupConfig, Problem, check_start
 from represent_jax.methods.plan import Stage
+from represent_jax.methods.population import member_of
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import bc, noise, policies, preference
 from represent_jax.stages.airl import AirlConfig
@@ -113,7 +114,7 @@ def plan(
     def train(key, directory, base, noisy, params):
         starts = None
         if config.policies.start == "phase1":
-            starts = [jax.tree.map(lambda x: x[0], base.policy)]
+            starts = [member_of(base.policy, 0)]
         return policy_learning.run(
             key,
             config.policies,
@@ -187,7 +188,7 @@ def _rewards_of(config: DrexConfig, params: Params) -> dict[str, Callable[..., j
 
 def _batch(noisy: NoisyData) -> TrajectoryBatch:
     """Rollouts of the only policy."""
-    return jax.tree.map(lambda x: x[0], noisy.trajectories)
+    return member_of(noisy.trajectories, 0)
 
 
 def _run_noise(key, config, env, cloned: Params, directory) -> NoisyData:

@@ -14,6 +14,7 @@ from represent_jax.envs import Environment, Episode
 from represent_jax.methods import pipeline, results
 from represent_jax.methods.config import MethodConfig, Problem
 from represent_jax.methods.plan import Stage
+from represent_jax.methods.population import member_of
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import airl
 from represent_jax.stages.airl import AirlConfig
@@ -111,7 +112,7 @@ def load_policies(
             params, obs, unused, config.airl, env.action_size, deterministic=True
         )
 
-    return {name: policy_of(_member(stacked, i)) for i, name in enumerate(config.group_names)}
+    return {name: policy_of(member_of(stacked, i)) for i, name in enumerate(config.group_names)}
 
 
 def _rewards_of(
@@ -120,11 +121,9 @@ def _rewards_of(
     def reward_of(params):
         return lambda *rows: airl.reward(params, *rows, config.airl)
 
-    return {name: reward_of(_member(output.reward, i)) for i, name in enumerate(config.group_names)}
-
-
-def _member(stacked: Any, i: int) -> Any:
-    return jax.tree.map(lambda x: x[i], stacked)
+    return {
+        name: reward_of(member_of(output.reward, i)) for i, name in enumerate(config.group_names)
+    }
 
 
 def _load(

@@ -74,7 +74,7 @@ def sharded(mesh: Mesh, program: Callable, axes_in: tuple, axes_out: Any) -> Cal
 
 
 def place(mesh: Mesh, tree: Any, axes: Any) -> Any:
-    """Puts a tree where `shared` reads it, unless it is there already."""
+    """Puts a tree where `sharded` reads it, unless it is there already."""
     axes = axis_of_leaves(axes, tree)
 
     def put(leaf, axis):

@@ -14,7 +14,7 @@ from represent_jax.envs import Environment, Episode
 from represent_jax.methods import pipeline, results
 from represent_jax.methods.config import MethodConfig, Problem, strategy_names
 from represent_jax.methods.plan import Stage
-from represent_jax.methods.population import stack
+from represent_jax.methods.population import member_of, stack
 from represent_jax.runs import RunDirectory
 from represent_jax.runs.loop import advance
 from represent_jax.stages import msrd
@@ -134,7 +134,7 @@ def load_policies(
     stacked, unused = _load(config, env, directory).policies, jax.random.PRNGKey(0)
 
     def policy_of(i):
-        params = jax.tree.map(lambda x: x[i], stacked)
+        params = member_of(stacked, i)
         return lambda obs, key=None: msrd.act(
             params, obs, unused, config.msrd, env.action_size, deterministic=True
         )

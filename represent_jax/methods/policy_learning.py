@@ -12,7 +12,7 @@ from represent_jax.agents.sac import PolicyParams
 from represent_jax.envs import Environment, Episode
 from represent_jax.methods.config import MethodConfig
 from represent_jax.methods.pipeline import numbers, shape_like
-from represent_jax.methods.population import Population, stack
+from represent_jax.methods.population import Population, member_of, stack
 from represent_jax.runs import RunDirectory
 from represent_jax.runs.loop import advance
 from represent_jax.stages import policies, selection
@@ -49,7 +49,7 @@ class Trained(NamedTuple):
 
     def policy(self, i: int) -> PolicyParams:
         """Returns the policy of objective i."""
-        return jax.tree.map(lambda x: x[i], self.policies)
+        return member_of(self.policies, i)
 
 
 def run(
@@ -94,8 +94,8 @@ def run(
     step = population.stepper(
         lambda state, member: policies.train(state, env, member[0], config, reward_fn)
     )
-    per_step = policies.agent_of(config)[1].env_steps_per_step
-    chunk_env_steps = max(1, config.eval_env_steps // per_step) * per_step
+    _, settings = policies.agent_of(config)
+    chunk_env_steps = policies.steps_per_evaluation(config) * settings.env_steps_per_step
     states = advance(
         directory,
         "policies",
@@ -206,7 +206,7 @@ def load(
         stacked = directory.load_output("policies", example)
 
     def policy_of(i):
-        params = jax.tree.map(lambda x: x[i], stacked)
+        params = member_of(stacked, i)
         return lambda obs, key=None: policies.act(
             params, obs, env.action_size, config.policies, key
         )

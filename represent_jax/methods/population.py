@@ -148,6 +148,11 @@ def stack(members: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
 
 
+def member_of(stacked: Any, i: int) -> Any:
+    """Takes member i out of a pytree whose leaves are `[num_members, ...]`."""
+    return jax.tree.map(lambda leaf: leaf[i], stacked)
+
+
 def _side_by_side(compiled: Callable, arguments: list[tuple]) -> list[Any]:
     """Calls a compiled program with each of the arguments, on as many threads."""
     with ThreadPoolExecutor(max_workers=len(arguments)) as pool:

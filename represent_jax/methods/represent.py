@@ -18,6 +18,7 @@ from represent_jax.methods import pipeline, policy_learning, results
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.plan import Stage
 from represent_jax.methods.policy_learning import Trained
+from represent_jax.methods.population import member_of
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import airl, decomposition, policies
 from represent_jax.types import Params, RewardFn
@@ -270,10 +271,7 @@ def _starts(
     reward_fn: RewardFn,
 ) -> Sequence[policies.PolicyParams]:
     """Phase 1's policy of each strategy; for the task that of the highest learned return."""
-    own = {
-        name: jax.tree.map(lambda x, i=i: x[i], first.policy)
-        for i, name in enumerate(config.group_names)
-    }
+    own = {name: member_of(first.policy, i) for i, name in enumerate(config.group_names)}
 
     def start_of(name, objective):
         if name in own:

@@ -4,7 +4,8 @@ What the truth is not known of is left out: demonstrators without true rewards a
 with, and without test trajectories nothing is said of unseen ones. Rollouts always have the
 environment's own reward.
 
-This is the only place where the true reward is looked at.
+This is where the true reward is looked at, and nothing is learned from what it says; D-REX's own
+accuracies look at it too (`methods.drex`), only to be reported.
 """
 
 import functools
@@ -20,6 +21,7 @@ from represent_jax.data.trajectories import TrajectoryBatch, pad
 from represent_jax.envs import Episode
 from represent_jax.methods.config import MethodConfig, Problem
 from represent_jax.methods.policy_learning import Trained
+from represent_jax.methods.population import member_of
 from represent_jax.runs import RunDirectory, provenance
 from represent_jax.stages import airl, curve, evaluation, noise, policies, style
 from represent_jax.stages.airl import AirlConfig
@@ -124,8 +126,7 @@ def judge_airl(
 def noisy_groups(config: MethodConfig, noisy: noise.NoisyData) -> dict[str, TrajectoryBatch]:
     """Phase 2's rollouts by group, as `judge_rewards` takes them."""
     return {
-        _noisy(name): jax.tree.map(lambda x, i=i: x[i], noisy.trajectories)
-        for i, name in enumerate(config.group_names)
+        _noisy(name): member_of(noisy.trajectories, i) for i, name in enumerate(config.group_names)
     }
 
 
@@ -173,17 +174,14 @@ def generators_episodes(
     levels = jnp.zeros(FINAL_EPISODES)
     roll_out = jax.jit(lambda params, key: rollouts.rollout(env, act, params, key, levels))
     return {
-        name: functools.partial(roll_out, jax.tree.map(lambda x, i=i: x[i], stacked))
-        for i, name in enumerate(names)
+        name: functools.partial(roll_out, member_of(stacked, i)) for i, name in enumerate(names)
     }
 
 
 def describe_curves(curves: curve.Curve) -> list[dict[str, Any]]:
     """The noise-performance curve of every strategy, for the report."""
     num_strategies = curves.r2.shape[0]
-    return [
-        _curve_results(jax.tree.map(lambda x, i=i: x[i], curves)) for i in range(num_strategies)
-    ]
+    return [_curve_results(member_of(curves, i)) for i in range(num_strategies)]
 
 
 def _curve_results(fitted: curve.Curve) -> dict[str, Any]:

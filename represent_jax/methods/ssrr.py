@@ -16,6 +16,7 @@ from represent_jax.envs import Environment
 from represent_jax.methods import pipeline, represent
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.plan import Stage
+from represent_jax.methods.population import member_of
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import decomposition
 from represent_jax.stages.regression_config import RegressionConfig
@@ -107,10 +108,7 @@ def load_rewards(
 def _by_target(
     config: SsrrConfig, rewards: decomposition.Rewards
 ) -> dict[str, decomposition.Rewards]:
-    return {
-        name: jax.tree.map(lambda x, i=i: x[i], rewards)
-        for i, name in enumerate(config.target_names)
-    }
+    return {name: member_of(rewards, i) for i, name in enumerate(config.target_names)}
 
 
 def _rewards_of(

@@ -166,6 +166,12 @@ def init(
     return PolicyState(state, best, to_beat)
 
 
+def steps_per_evaluation(config: PoliciesConfig) -> int:
+    """The agent's training steps between two evaluations, each of `env_steps_per_step`."""
+    _, settings = agent_of(config)
+    return max(1, config.eval_env_steps // settings.env_steps_per_step)
+
+
 def train(
     state: PolicyState,
     env: Episode,
@@ -175,7 +181,7 @@ def train(
 ) -> tuple[PolicyState, Metrics]:
     """Trains for `eval_env_steps`, evaluates, and keeps the better policy by learned return."""
     agent, settings = agent_of(config)
-    num_steps = max(1, config.eval_env_steps // settings.env_steps_per_step)
+    num_steps = steps_per_evaluation(config)
     agent_state, metrics = agent.train(
         state.agent,
         env,
