@@ -308,12 +308,38 @@ def test_csv_of_a_person(tmp_path):
         ("x,y\n0,1\n", "no columns obs_0"),
         ("episode,obs_0,action_0\n0,0,1\n0,1,\n1,0,1\n1,1,1\n", "others do not"),
         ("", "no columns obs_0"),
+        ("obs_0,strategy\n0,nan\n1,nan\n", "strategy: expected whole numbers from 0, found nan"),
+        ("obs_0,strategy\n0,0.9\n1,0.9\n", "strategy: expected whole numbers from 0, found 0.9"),
+        ("obs_0,strategy\n0,0\n1,1\n", r"strategy: expected one of each episode, found \[0, 1\]"),
+        ("obs_0,terminated\n0,0\n1,2\n", "column terminated: expected 0 or 1, found '2'"),
     ],
 )
 def test_csv_that_is_no_table_of_episodes(tmp_path, text, message):
     (tmp_path / "mine.csv").write_text(text)
     with pytest.raises(RepresentError, match=message):
         formats.read("arrays", [str(tmp_path / "mine.csv")], "cart")
+
+
+@pytest.mark.parametrize(
+    "strategy, message",
+    [
+        ([0, 0, 1, 1], r"strategy: expected one of each episode, found \[0, 1\]"),
+        ([0.0, 0.0, 0.0, np.nan], "strategy: expected whole numbers from 0, found nan"),
+        ([-1, -1, -1, -1], "strategy: expected whole numbers from 0, found -1"),
+        (["a", "a", "b", "b"], "strategy: expected whole numbers from 0, found <U1"),
+    ],
+)
+def test_rows_whose_strategies_are_none(strategy, message):
+    rows = {
+        "observations": np.arange(4.0)[:, None],
+        "next_observations": np.arange(1.0, 5.0)[:, None],
+        "strategy": np.array(strategy),
+    }
+    with pytest.raises(RepresentError, match=message):
+        flat.from_arrays(rows)
+    rows["strategy"] = np.array([1.0, 1.0, 1.0, 1.0])
+    [trajectory], _ = flat.from_arrays(rows)
+    assert trajectory.strategy == 1
 
 
 # --- what is no file of the format ---

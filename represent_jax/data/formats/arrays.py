@@ -127,8 +127,8 @@ def _from_table(rows: Sequence[Mapping[str, str]]) -> tuple[list[Trajectory], li
             _floats(episode, obs_columns),
             _floats(steps, action_columns) if action_columns else None,
             _floats(steps, ["reward"])[:, 0] if "reward" in columns else None,
-            _number(episode[-1].get("terminated", "0"), "terminated") == 1,
-            int(_number(episode[0].get("strategy", "0"), "strategy")),
+            _flag(episode[-1].get("terminated", "0"), "terminated"),
+            flat.one_strategy(_floats(episode, ["strategy"])) if "strategy" in columns else 0,
         )
         (whole if last_is_empty else cut).append(piece)
     if cut and whole:
@@ -150,6 +150,13 @@ def _numbered(columns: Sequence[str], prefix: str) -> list[str]:
 def _floats(rows: Sequence[Mapping[str, str]], columns: Sequence[str]) -> np.ndarray:
     values = [[_number(row[column], column) for column in columns] for row in rows]
     return np.array(values, np.float64).reshape(len(rows), len(columns))
+
+
+def _flag(text: str, column: str) -> bool:
+    value = _number(text, column)
+    if value not in (0.0, 1.0):
+        raise RepresentError(f"column {column}: expected 0 or 1, found {text!r}")
+    return value == 1.0
 
 
 def _number(text: str, column: str) -> float:

@@ -128,6 +128,33 @@ def _find(arrays: Mapping[str, np.ndarray], name: str) -> str | None:
     return next((key for key in NAMES[name] if key in arrays), None)
 
 
+def strategies_of(values: np.ndarray) -> np.ndarray:
+    """Returns strategies as integers.
+
+    Raises:
+        RepresentError: some are no whole numbers from 0.
+    """
+    numbers = np.asarray(values)
+    if numbers.dtype.kind not in "biuf":
+        raise RepresentError(f"strategy: expected whole numbers from 0, found {numbers.dtype}")
+    bad = ~np.isfinite(numbers) | (numbers < 0) | (numbers != np.floor(numbers))
+    if bad.any():
+        raise RepresentError(f"strategy: expected whole numbers from 0, found {numbers[bad][0]}")
+    return numbers.astype(int)
+
+
+def one_strategy(of_rows: np.ndarray) -> int:
+    """Returns the strategy of an episode, which all of its rows have to have.
+
+    Raises:
+        RepresentError: they have several, or some are no whole numbers from 0.
+    """
+    found = np.unique(strategies_of(of_rows))
+    if len(found) > 1:
+        raise RepresentError(f"strategy: expected one of each episode, found {found.tolist()}")
+    return int(found[0])
+
+
 def _flags(found: Mapping[str, np.ndarray], name: str, num: int) -> np.ndarray:
     values = found.get(name, np.zeros(num, bool))
     if values.shape != (num,):
@@ -178,7 +205,7 @@ def _from_rows(found: Mapping[str, np.ndarray]) -> tuple[list[Trajectory], list[
         split("actions"),
         split("rewards"),
         [rows[-1] for rows in np.split(terminals, cuts)],
-        [rows[0] for rows in np.split(strategy, cuts)],
+        [one_strategy(rows) for rows in np.split(strategy, cuts)],
         strict=True,
     )
     if next_obs is None:
@@ -219,7 +246,7 @@ def _from_episodes(found: Mapping[str, np.ndarray]) -> tuple[list[Trajectory], l
         split("actions"),
         split("rewards"),
         _flags(found, "terminated", num),
-        found.get("strategy", np.zeros(num, int)).reshape(-1),
+        strategies_of(found.get("strategy", np.zeros(num, int)).reshape(-1)),
         strict=True,
     )
     return [Trajectory(*piece) for piece in pieces], []
