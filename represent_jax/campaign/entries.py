@@ -9,6 +9,7 @@ from represent_jax import config as configs
 from represent_jax.campaign.variants import VARIANTS, runs_of
 from represent_jax.data.catalogue import load_demonstrations, load_test
 from represent_jax.envs import make_env
+from represent_jax.errors import unknown
 from represent_jax.methods.config import MethodConfig, Problem, make_problem
 from represent_jax.methods.plan import nodes
 from represent_jax.methods.registry import find_method
@@ -86,6 +87,8 @@ def make_entry(recipe: Recipe) -> Entry:
       UsageError: no variant, domain or preset of that name, or a setting that does not fit.
       RepresentError: demonstrations do not fit their environment.
     """
+    if recipe.variant not in VARIANTS:
+        raise unknown("variant", recipe.variant, VARIANTS)
     variant = VARIANTS[recipe.variant]
     config = variant.config(recipe.preset, recipe.domain, recipe.overrides)
     env = _env(config.env, config.backend)

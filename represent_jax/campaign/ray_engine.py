@@ -133,7 +133,14 @@ class RayEngine:
             return node, f"{type(error).__name__} after {self._config.retries} retries: {lost}"
         if outcome.parcel is not None:
             unpack(outcome.parcel, graph.folder / node.hash)
+        self._forget(graph, node)
         return node, outcome.error
+
+    def _forget(self, graph: Graph, ended: Node) -> None:
+        """Lets Ray drop the parcels that no node still needs."""
+        waiting = [node for node in graph.left if node is not ended]
+        needed = {one.hash for node in waiting for one in with_inputs(node)}
+        self._parcels = {of: parcel for of, parcel in self._parcels.items() if of in needed}
 
     def _parcel(self, graph: Graph, node: Node) -> Any:
         """Reference to a node's folder in Ray's object store."""

@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import json
 import time
+import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -181,19 +182,23 @@ class Graph:
         """Runs one node here and marks it as done; returns what went wrong, or None."""
         start = time.monotonic()
         try:
-            inputs = self._inputs(node)
             tracker = self._track(node, self.folder / node.hash) if self._track else None
             with self.directory(node, tracker) as directory:
-                self._outputs[node.hash] = node.run(directory, *inputs)
+                self._outputs[node.hash] = node.run(directory, *self._inputs(node))
         except Exception as error:
-            return f"{type(error).__name__}: {error}"
+            return self._explain(node, error)
+        self._traceback(node).unlink(missing_ok=True)
         seconds = round(time.monotonic() - start, 1)
         with replacing(self._mark(node)) as temporary:
             temporary.write_text(json.dumps({"name": node.name, "seconds": seconds}) + "\n")
         return None
 
     def output(self, node: Node) -> Any:
-        """Returns the output of a node that is done, from memory or from its folder."""
+        """Returns the output of a node that is done, from memory or from its folder.
+
+        Raises:
+          RepresentError: the node is not done.
+        """
         if node.hash not in self._outputs:
             if self.states.get(node.hash) != DONE:
                 raise RepresentError(f"{node.name}: has no output, it is not done")
@@ -208,6 +213,20 @@ class Graph:
 
     def _inputs(self, node: Node) -> Sequence[Any]:
         return [self.output(before) for before in node.inputs]
+
+    def _explain(self, node: Node, error: Exception) -> str:
+        """What went wrong and, where that is a fault of the program, where its traceback is."""
+        said = f"{type(error).__name__}: {error}"
+        if isinstance(error, RepresentError):
+            return said
+        try:
+            self._traceback(node).write_text("".join(traceback.format_exception(error)))
+        except OSError:
+            return said
+        return f"{said} (see {self._traceback(node).relative_to(self.folder)})"
+
+    def _traceback(self, node: Node) -> Path:
+        return self.folder / node.hash / "traceback.txt"
 
     def _mark(self, node: Node) -> Path:
         return self.folder / node.hash / MARK

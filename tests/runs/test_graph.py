@@ -76,6 +76,24 @@ def test_a_failure_blocks_what_lies_behind_it_and_nothing_else(tmp_path):
     assert [node.name for node in Graph([behind, beside], tmp_path).left] == ["broken", "behind"]
 
 
+def test_a_fault_of_the_program_leaves_its_traceback_until_the_stage_is_done(tmp_path):
+    faulty = [True]
+
+    def run(directory):
+        return {}["absent"] if faulty else 3
+
+    node = Node("adder", "faulty", {}, (), run)
+    graph = Graph([node], tmp_path)
+    graph.run(_quiet)
+    assert graph.errors[node.hash] == f"KeyError: 'absent' (see {node.hash}/traceback.txt)"
+    kept = tmp_path / node.hash / "traceback.txt"
+    assert 'return {}["absent"]' in kept.read_text()
+    faulty.clear()
+    again = Graph([node], tmp_path)
+    again.run(_quiet)
+    assert again.output(node) == 3 and not kept.exists()
+
+
 def test_time_left_is_unknown_until_every_kind_has_run(tmp_path):
     work = Arithmetic()
     assert Graph([work.node("a", 1)], tmp_path).seconds_left() is None
