@@ -18,6 +18,7 @@ _TARGET = flags.DEFINE_string("target", "task", "Whose policy: task, strategy_1,
 _OUT = flags.DEFINE_string("out", "policy.mp4", "Video to write.")
 _STEPS = flags.DEFINE_integer("steps", 300, "Environment steps to show.", lower_bound=1)
 _SEED = flags.DEFINE_integer("seed", 0, "Seed of the initial state.")
+_BACKEND = flags.DEFINE_string("backend", None, "Physics engine; that of the run if not given.")
 _CAMERA = flags.DEFINE_string(
     "camera", None, "Name of the camera; one that follows the robot if there is."
 )
@@ -26,7 +27,8 @@ _CAMERA = flags.DEFINE_string(
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     policy = load_policy(_RUN.value, _TARGET.value)
-    env = make_env(load_config(_RUN.value).env)
+    config = load_config(_RUN.value)
+    env = make_env(config.env, _BACKEND.value or config.backend)
     if not isinstance(env, Environment):
         raise UsageError(f"{env.name}: only tasks on the engines of this package can be shown")
 

@@ -94,9 +94,10 @@ def main(argv: list[str]) -> None:
             units_per_chunk=env_steps,
             describe=lambda m: f"true return {float(m['true_return']):.1f}",
         )
-        run.save_output("policy", agent.policy_of(state.learner))
         path = [(line["step"], line["true_return"]) for line in run.read_log("policy")]
         run.write_results({"env_steps": [s for s, _ in path], "true_return": [r for _, r in path]})
+        # Last, since the run counts as done from here on.
+        run.save_output("policy", agent.policy_of(state.learner))
         seconds = time.monotonic() - start
     print(f"true return {path[-1][1]:.1f} after {path[-1][0]:,} env steps, {seconds:.0f} s")
 
