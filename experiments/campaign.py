@@ -78,6 +78,7 @@ def main(argv: list[str]) -> None:
             print(f"{'done' if graph.is_done(node) else 'left':5} {node.hash} {node.name}")
         _print_time(graph)
         return
+    launch.require_writable(records)
     provenance()  # Of the code that is loaded now: a checkout may change while stages run.
     record(graph, every, records)
     started: dict[str, float] = {}

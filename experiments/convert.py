@@ -24,6 +24,7 @@ _INPUTS = flags.DEFINE_list(
 )
 _TO = flags.DEFINE_string("to", "npz", "Format of the output, one of those of --from.")
 _OUT = flags.DEFINE_string("out", None, "File, folder or dataset to write.")
+_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace a file that --out names.")
 _ENV = flags.DEFINE_string("env", "", "Environment they are of; our own exports say so themselves.")
 _LEAVE_OUT = flags.DEFINE_list("leave_out", [], "Of actions and rewards: what not to take over.")
 
@@ -31,6 +32,8 @@ _LEAVE_OUT = flags.DEFINE_list("leave_out", [], "Of actions and rewards: what no
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     target = formats.find_format(_TO.value)
+    if _OUT.value and not _OVERWRITE.value:
+        launch.refuse_to_replace(_OUT.value)
     data = formats.read(_FROM.value, _INPUTS.value, _ENV.value, _LEAVE_OUT.value)
     print("\n".join(_describe(data)))
     if _OUT.value:

@@ -37,6 +37,7 @@ _OUT = flags.DEFINE_string("out", None, "File to write the labelled demonstratio
 _NUM_STRATEGIES = flags.DEFINE_integer(
     "num_strategies", 0, "How many strategies there are; 0 finds out.", lower_bound=0
 )
+_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace a file that --out names.")
 _FIRST = flags.DEFINE_integer(
     "first", 0, "Of the pool, only the trajectories labelled as one of the first; 0 takes all."
 )
@@ -57,6 +58,8 @@ def main(argv: list[str]) -> None:
     config = configs.apply_overrides(
         StrategiesConfig(num_strategies=_NUM_STRATEGIES.value), _OVERRIDE.value
     )
+    if _OUT.value and not _OVERWRITE.value:
+        launch.refuse_to_replace(_OUT.value)
     pool = load_demonstrations(_DEMONSTRATIONS.value)
     if _BY_AGENT.value:
         pool = demonstrators.by_agent(pool)

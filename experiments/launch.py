@@ -18,6 +18,7 @@ from pathlib import Path
 
 from absl import app, flags, logging
 
+from represent_jax.data.atomic import disk_errors
 from represent_jax.errors import RepresentError, UsageError
 
 _TRACEBACK = flags.DEFINE_bool("traceback", False, "Show where an error came from.")
@@ -94,6 +95,32 @@ def refuse_beside(cause: str, names: Sequence[str]) -> None:
     given = [f"--{name}" for name in names if flags.FLAGS[name].present]
     if given:
         raise UsageError(f"{', '.join(given)}: without effect {cause}")
+
+
+def refuse_to_replace(path: str | os.PathLike) -> None:
+    """Refuses to write a file over what is there.
+
+    Raises:
+        UsageError: there is something.
+    """
+    if os.path.exists(path):
+        raise UsageError(f"out: {path} exists already; give another name, or --overwrite")
+
+
+def require_writable(path: str | os.PathLike) -> None:
+    """Refuses a file that could not be written in the end, before what is to be in it is computed.
+
+    Raises:
+        RepresentError: it cannot be written.
+    """
+    path = Path(path)
+    existed = path.exists()
+    with disk_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "ab"):
+            pass
+        if not existed:
+            path.unlink()
 
 
 def open_page(page: Path) -> None:

@@ -8,7 +8,6 @@ python -m experiments.make_demonstrations --env=my_robots:Swimmer --out=data \\
     --override diayn.num_skills=2 --override target_returns=20,30
 """
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,6 +29,7 @@ _ENV = flags.DEFINE_string(
     "Environment whose demonstrators to make, or half_cheetah_8: eight strategies, no test set.",
 )
 _OUT = flags.DEFINE_string("out", "represent_jax/data/shipped", "Folder to write to.")
+_OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace files that are in the folder.")
 _PART = flags.DEFINE_enum("part", "both", ["both", "demonstrations", "test"], "What to make.")
 _OVERRIDE = flags.DEFINE_multi_string("override", [], "Setting as dotted.key=value; repeatable.")
 _BACKEND = flags.DEFINE_string("backend", "auto", "Physics engine: auto, mujoco or mjx.")
@@ -41,18 +41,24 @@ def main(argv: list[str]) -> None:
     config = known.get(_ENV.value) or _robots_own(_ENV.value)
     config = configs.apply_overrides(config, _OVERRIDE.value)
     out = Path(_OUT.value)
-    os.makedirs(out, exist_ok=True)
     driven = isinstance(config, operators.OperatorsConfig)
     # Of shipped demonstrations, some are a domain's second set.
     name = _ENV.value if _ENV.value in known else config.env
     if _PART.value == "test" and name != config.env:
         raise UsageError(f"part: {name} has no test set of its own, but that of {config.env}")
+    made = []
     if _PART.value in ("both", "demonstrations"):
         make = _drive_demonstrations if driven else _make_demonstrations
-        make(config, out / f"{name}.npz")
+        made.append((make, out / f"{name}.npz"))
     if _PART.value in ("both", "test") and name == config.env:
         make = _drive_test_set if driven else _make_test_set
-        make(config, out / f"{config.env}_test.npz")
+        made.append((make, out / f"{config.env}_test.npz"))
+    for _, path in made:
+        if not _OVERWRITE.value:
+            launch.refuse_to_replace(path)
+        launch.require_writable(path)
+    for make, path in made:
+        make(config, path)
 
 
 def _robots_own(name: str) -> demonstrators.DemonstratorConfig:

@@ -30,7 +30,9 @@ _METHOD = flags.DEFINE_string(
 )
 _PRESET = flags.DEFINE_string("preset", "quick", "Settings to begin with: smoke, quick or paper.")
 _SEED = flags.DEFINE_integer("seed", 0, "Seed of everything after the demonstrations.")
-_NUM_SEEDS = flags.DEFINE_integer("num_seeds", 1, "Number of seeds, from --seed on, in turn.")
+_NUM_SEEDS = flags.DEFINE_integer(
+    "num_seeds", 1, "Number of seeds, from --seed on, in turn.", lower_bound=1
+)
 _BACKEND = flags.DEFINE_string("backend", "auto", "Physics engine: auto, mujoco or mjx.")
 _DEMONSTRATIONS = flags.DEFINE_string(
     "demonstrations", "", "Name or npz file of demonstrations; the environment's own if empty."
@@ -62,6 +64,8 @@ _DRY_RUN = flags.DEFINE_bool("dry_run", False, "Show settings and stages, and ru
 def main(argv: list[str]) -> None:
     launch.refuse_arguments(argv)
     launch.compile_quickly(_PRESET.value)
+    if _RECORD.value:
+        launch.require_writable(_RECORD.value)
     for seed in range(_SEED.value, _SEED.value + _NUM_SEEDS.value):
         config = dataclasses.replace(
             make_config(_PRESET.value, _ENV.value, _METHOD.value),

@@ -54,13 +54,18 @@ def main(argv: list[str]) -> None:
     env = make_env(name, backend="mujoco")
     path = _OUT.value or f"demonstrations/{name}.npz"
     session = Session(env, path, _HORIZON.value, _SEED.value, policy)
+    drives = session.keyboard is not None
+    if drives:
+        launch.require_writable(path)
+    else:
+        launch.refuse_beside(f"since nothing is recorded: no keys drive {name}", ("out",))
     model = env.engine.model
     camera = _CAMERA.value or offscreen.default_camera(model)
     painter = Painter(model, (_WIDTH.value, _HEIGHT.value), camera)
 
     def announce(address: str) -> None:
-        does = "Watch" if policy else "Drive"
-        where = "nothing is recorded" if policy else f"episodes go to {path}"
+        does = "Drive" if drives else "Watch"
+        where = f"episodes go to {path}" if drives else "nothing is recorded"
         print(f"{does} at {address} (Ctrl-C ends); {where}", flush=True)
         if _HOST.value not in server.LOOPBACK:
             print("Whoever can reach this address can drive and record.", flush=True)

@@ -12,7 +12,7 @@ from represent_jax.data.trajectories import Demonstrations
 from represent_jax.envs import make_env
 from represent_jax.errors import UsageError, unknown
 from represent_jax.methods.config import MethodConfig, make_problem
-from represent_jax.methods.plan import execute
+from represent_jax.methods.plan import execute, stage_names
 from represent_jax.methods.registry import find_method
 from represent_jax.runs import RunDirectory, load_config_json, open_run
 from represent_jax.stages import strategies
@@ -51,8 +51,9 @@ def learn(
       RepresentError: the data do not fit the environment, or a loss diverged.
     """
     problem = make_problem(config, make_env(config.env, config.backend), demonstrations, test)
+    stages = find_method(config.method).plan(config, problem)
+    stage_names(stages, until)
     with open_run(run_dir, config, resume=resume) as run:
-        stages = find_method(config.method).plan(config, problem)
         return execute(config, problem, stages, run, until)
 
 

@@ -6,13 +6,17 @@ from pathlib import Path
 
 from represent_jax.data.npz import load_demonstrations as load_file
 from represent_jax.data.trajectories import Demonstrations
-from represent_jax.errors import unknown
+from represent_jax.errors import UsageError, unknown
 
 
 def names() -> tuple[str, ...]:
     """Returns the names of what ships with the package; a "_test" set goes with each domain."""
     folder = resources.files("represent_jax.data.shipped")
     return tuple(sorted(Path(f.name).stem for f in folder.iterdir() if f.name.endswith(".npz")))
+
+
+# Files of formats that `data.formats` reads.
+_OF_OTHERS = (".csv", ".h5", ".hdf5")
 
 
 def load_demonstrations(name_or_path: str | os.PathLike) -> Demonstrations:
@@ -26,9 +30,16 @@ def load_demonstrations(name_or_path: str | os.PathLike) -> Demonstrations:
         folder = resources.files("represent_jax.data.shipped")
         with resources.as_file(folder / f"{name_or_path}.npz") as path:
             return load_file(path)
-    if not Path(name_or_path).exists():
+    path = Path(name_or_path)
+    if not path.exists():
+        if path.suffix or len(path.parts) > 1:
+            raise UsageError(f"{name_or_path}: no such file of demonstrations")
         raise unknown("demonstrations", str(name_or_path), names())
-    return load_file(name_or_path)
+    if path.suffix.lower() in _OF_OTHERS:
+        raise UsageError(
+            f"{name_or_path}: expected an npz file of demonstrations; experiments.convert makes one"
+        )
+    return load_file(path)
 
 
 def load_test(env_name: str, name_or_path: str | os.PathLike = "") -> Demonstrations | None:

@@ -28,13 +28,19 @@ def test_two_tables_become_two_strategies(tmp_path):
     assert "mean return 5.0" in said.stdout
     held = rj.load_demonstrations(out)
     assert held.num_strategies == 2 and held.action_dim == 1 and held.has_rewards
+    # What somebody recorded is not written over by a name given twice.
+    again = convert("--inputs=hopper", f"--out={out}")
+    assert again.returncode == 2 and "exists already" in again.stderr
+    assert rj.load_demonstrations(out).env_name == "cart"
+    assert convert("--inputs=hopper", f"--out={out}", "--overwrite").returncode == 0
+    assert rj.load_demonstrations(out).env_name == "hopper"
 
 
 @pytest.mark.parametrize(
     "flags, message",
     [
         (("--from=minary", "--inputs=a"), "did you mean minari"),
-        (("--inputs=nothing.npz", "--leave_out=rewards"), "unknown demonstrations 'nothing.npz'"),
+        (("--inputs=nothing.npz", "--leave_out=rewards"), "nothing.npz: no such file"),
     ],
 )
 def test_bad_usage_is_one_line(flags, message):

@@ -7,7 +7,7 @@ from absl import flags
 from absl.testing import flagsaver
 
 from experiments import launch
-from represent_jax.errors import UsageError
+from represent_jax.errors import RepresentError, UsageError
 
 
 def test_settings_are_passed_on():
@@ -29,6 +29,19 @@ def test_only_smoke_is_compiled_quickly_and_only_where_nobody_says_how(monkeypat
     monkeypatch.setenv("XLA_FLAGS", "--xla_dump_to=/dump")
     launch.compile_quickly("smoke")
     assert os.environ["XLA_FLAGS"] == "--xla_dump_to=/dump"
+
+
+def test_files_that_cannot_be_written_are_refused_and_others_left_as_they_are(tmp_path):
+    new, old, place = tmp_path / "folder" / "new", tmp_path / "old", tmp_path / "old" / "below"
+    old.write_text("kept")
+    launch.require_writable(new)
+    launch.require_writable(old)
+    assert not new.exists() and old.read_text() == "kept"
+    with pytest.raises(RepresentError, match="old/below: cannot be written"):
+        launch.require_writable(place)
+    launch.refuse_to_replace(new)
+    with pytest.raises(UsageError, match=r"out: .*old exists already"):
+        launch.refuse_to_replace(old)
 
 
 def test_a_launcher_that_runs_alone_refuses_other_processes(capsys):

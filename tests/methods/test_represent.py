@@ -107,6 +107,15 @@ def test_merged_demonstrations_are_those_of_one_strategy():
     assert config.target_names == ("task",)
 
 
+def test_a_stage_that_there_is_not_leaves_no_folder(tmp_path):
+    config = make_config("smoke", "half_cheetah")
+    with pytest.raises(UsageError, match="did you mean regression"):
+        rj.learn(
+            tmp_path / "run", config, rj.load_demonstrations("half_cheetah"), until="regresion"
+        )
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize(
     ("grouping", "groups"),
     [("separate", ({0}, {1})), ("merged", ({0, 1},)), ("strategy_2", ({1},))],
