@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from represent_jax import config as configs
 from represent_jax.data.trajectories import Demonstrations
@@ -107,7 +108,7 @@ def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
 
     Raises:
       RepresentError: the run has not finished its reward learning, or its method learns none.
-      UsageError: (when called) no target of that name.
+      UsageError: (when called) no target of that name, or arrays of other shapes.
     """
     config = load_config(run_dir)
     env = make_env(config.env, config.backend)
@@ -116,8 +117,12 @@ def load_reward(run_dir: str | os.PathLike) -> Callable[..., jax.Array]:
     def reward(obs_t, action_t, next_obs_t, target: str = "task") -> jax.Array:
         if target not in rewards:
             raise unknown("target", target, rewards)
-        rows = (obs_t, action_t, next_obs_t)
-        return rewards[target](*(None if x is None else jnp.asarray(x) for x in rows))
+        leading = np.shape(next_obs_t)[:-1]
+        return rewards[target](
+            _sized("obs_t", obs_t, (*leading, env.observation_size)),
+            None if action_t is None else _sized("action_t", action_t, (*leading, env.action_size)),
+            _sized("next_obs_t", next_obs_t, (*leading, env.observation_size)),
+        )
 
     return reward
 
@@ -168,7 +173,7 @@ def load_policy(run_dir: str | os.PathLike, target: str = "task") -> Callable[..
 
     Raises:
       RepresentError: the run has not trained its policies, or they carry a hidden state.
-      UsageError: no target of that name.
+      UsageError: no target of that name, or (when called) observations of another size.
     """
     config = load_config(run_dir)
     if target not in config.policy_names:
@@ -177,4 +182,16 @@ def load_policy(run_dir: str | os.PathLike, target: str = "task") -> Callable[..
     policies = find_method(config.method).load_policies(config, env, RunDirectory(run_dir))
     if target not in policies:
         raise unknown("policy", target, policies)
-    return lambda obs, key=None: policies[target](jnp.asarray(obs), key)
+
+    def policy(obs, key=None) -> jax.Array:
+        shape = (*np.shape(obs)[:-1], env.observation_size)
+        return policies[target](_sized("obs", obs, shape), key)
+
+    return policy
+
+
+def _sized(field: str, values: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    configs.require(
+        np.shape(values) == shape, field, f"an array of shape {shape}", np.shape(values)
+    )
+    return jnp.asarray(values)

@@ -168,6 +168,17 @@ def test_loaded_reward_and_policy(finished):
     jitted = jax.jit(jax.vmap(lambda o: reward(o, action[0], o)))(obs)
     np.testing.assert_allclose(jitted, task, rtol=1e-5)
     assert policy(obs).shape == action.shape and float(np.abs(policy(obs)).max()) <= 1.0
+    for field, rows in {
+        "obs_t": (obs[:-1], action, obs),
+        "action_t": (obs, action[:, :0], obs),
+        "next_obs_t": (obs, action, obs[:, :5]),
+    }.items():
+        with pytest.raises(UsageError, match=rf"^{field}: expected an array of shape \(5, \d+\)"):
+            reward(*rows)
+    with pytest.raises(
+        UsageError, match=r"^obs: expected an array of shape \(5, 11\), found \(5, 5\)"
+    ):
+        policy(obs[:, :5])
     with pytest.raises(UsageError, match="strategy_2"):
         reward(obs, action, obs, target="strategy_3")
     with pytest.raises(UsageError, match="strategy_1"):
