@@ -6,6 +6,7 @@ behind it.
 """
 
 import dataclasses
+import functools
 import hashlib
 import json
 import time
@@ -42,7 +43,7 @@ class Node:
     inputs: tuple["Node", ...]
     run: Callable[..., Any]
 
-    @property
+    @functools.cached_property
     def hash(self) -> str:
         """Hash of kind, settings and inputs; the name plays no part."""
         told = [self.kind, self.settings, [node.hash for node in self.inputs]]

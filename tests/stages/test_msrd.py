@@ -14,7 +14,7 @@ from represent_jax.envs import make_env
 from represent_jax.errors import UsageError
 from represent_jax.methods.config import make_problem
 from represent_jax.methods.pipeline import transitions_of
-from represent_jax.methods.population import stack
+from represent_jax.methods.population import member_of, stack
 from represent_jax.methods.presets import make_config
 from represent_jax.stages import msrd
 from represent_jax.stages.discriminator import Rows
@@ -60,12 +60,8 @@ def _state(hidden_sizes=(8,)):
     return jax.jit(lambda key: msrd.init_rewards(key, shown, config))(jax.random.PRNGKey(10))
 
 
-def _member(stacked, i):
-    return jax.tree.map(lambda x: x[i], stacked)
-
-
 def _of_strategy(rewards, i):
-    own = _member((rewards.strategies, rewards.shaping), i)
+    own = member_of((rewards.strategies, rewards.shaping), i)
     return rewards._replace(strategies=own[0], shaping=own[1])
 
 
@@ -284,7 +280,7 @@ def started(problem, demonstrations):
 def test_generators_start_as_clones_of_their_own_demonstrations(problem, demonstrations, started):
     policies = msrd.finish(started).policies
     for i, expected in enumerate(SHOWN_ACTIONS):
-        policy, obs = _member(policies, i), demonstrations.obs_t[i]
+        policy, obs = member_of(policies, i), demonstrations.obs_t[i]
         size = problem.env.action_size
         mode = msrd.act(policy, obs, jax.random.PRNGKey(0), CONFIG, size, deterministic=True)
         assert mode.shape == (len(obs), size)
