@@ -26,10 +26,13 @@ SECONDS = 90.0
 
 
 @contextlib.contextmanager
-def launched(env: str, folder: Path, *flags: str) -> Iterator[tuple[subprocess.Popen, str]]:
+def launched(
+    env: str, folder: Path, *flags: str, announces: str = "Drive"
+) -> Iterator[tuple[subprocess.Popen, str]]:
     """Yields the process of the launcher, and the address it serves; kills it in the end.
 
-    It runs in `folder`, and records to `demonstrations/<env>.npz` there.
+    It runs in `folder`, and records to `demonstrations/<env>.npz` there. `announces` is the word
+    before the address: `Watch` for a robot that no keys drive.
     """
     command = [sys.executable, "-m", "experiments.teleoperate", f"--env={env}", "--port=0"]
     path = os.pathsep.join([str(_REPOSITORY), os.environ.get("PYTHONPATH", "")])
@@ -42,7 +45,7 @@ def launched(env: str, folder: Path, *flags: str) -> Iterator[tuple[subprocess.P
     ) as process:
         try:
             line = process.stdout.readline()
-            assert line.startswith("Drive at http://localhost:"), line
+            assert line.startswith(f"{announces} at http://localhost:"), line
             yield process, line.split()[2]
         finally:
             process.kill()

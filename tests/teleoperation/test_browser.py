@@ -91,7 +91,7 @@ def test_a_key_in_a_browser_moves_the_arm_of_the_kitchen(tmp_path):
 def test_the_page_says_when_the_server_is_gone(tmp_path):
     with (
         chromium(tmp_path / "profile") as driver,
-        launched("hopper", tmp_path) as (process, address),
+        launched("hopper", tmp_path, announces="Watch") as (process, address),
     ):
         driver.get(address)
         page = TeleoperationPage(driver)
