@@ -351,9 +351,21 @@ def with_reward(
 
 
 def update(
-    learner: LearnerState, batch: Transition, key: jax.Array, config: SacConfig
+    learner: LearnerState,
+    batch: Transition,
+    key: jax.Array,
+    config: SacConfig,
+    prior_share: jax.Array | float = 1.0,
 ) -> tuple[LearnerState, Metrics]:
-    """Makes one gradient update of temperature, critics and actor from a batch `[batch_size]`."""
+    """Makes one gradient update of temperature, critics and actor from a batch `[batch_size]`.
+
+    Args:
+      learner: networks and optimisers.
+      batch: transitions.
+      key: PRNG key.
+      config: settings.
+      prior_share: what is left of the prior's weight, and of a temperature that is not learned.
+    """
     networks = make_networks(batch.obs_t.shape[-1], batch.action_t.shape[-1], config)
     key_temperature, key_critic, key_actor = jax.random.split(key, 3)
     transitions = brax_types.Transition(
@@ -366,6 +378,9 @@ def update(
         extras={"state_extras": {"truncation": jnp.zeros_like(batch.reward_t)}},
     )
     temperature = jnp.exp(learner.log_temperature)
+    if not config.learn_temperature:
+        temperature *= prior_share
+    prior_weight = config.prior_weight * prior_share
     critic_loss, q_grads = jax.value_and_grad(networks.critic_loss)(
         learner.q_params,
         learner.policy_params,
@@ -376,7 +391,7 @@ def update(
         key_critic,
     )
     actor_loss, policy_grads = jax.value_and_grad(_actor_loss)(
-        learner.policy_params, learner, networks, temperature, transitions, key_actor, config
+        learner.policy_params, learner, networks, temperature, prior_weight, transitions, key_actor
     )
     q_updates, q_opt = networks.optimizer.update(q_grads, learner.q_opt)
     policy_updates, policy_opt = networks.optimizer.update(policy_grads, learner.policy_opt)
@@ -413,7 +428,7 @@ def update(
     return learner, metrics
 
 
-def _actor_loss(policy_params, learner, networks, temperature, transitions, key, config):
+def _actor_loss(policy_params, learner, networks, temperature, prior_weight, transitions, key):
     loss = networks.actor_loss(
         policy_params, learner.obs_stats, learner.q_params, temperature, transitions, key
     )
@@ -426,18 +441,23 @@ def _actor_loss(policy_params, learner, networks, temperature, transitions, key,
     unbounded_action_t = distribution.sample_no_postprocessing(logits, key)
     logits_prior = policy_network.apply(prior.obs_stats, prior.policy, obs_t)
     log_prior = distribution.log_prob(logits_prior, unbounded_action_t)
-    return loss - config.prior_weight * jnp.mean(log_prior)
+    return loss - prior_weight * jnp.mean(log_prior)
 
 
-def learn(state: SacState, batches: Transition, config: SacConfig) -> tuple[SacState, Metrics]:
-    """Makes one update for each batch, `[num_updates, batch_size]`, in order."""
+def learn(
+    state: SacState,
+    batches: Transition,
+    config: SacConfig,
+    prior_share: jax.Array | float = 1.0,
+) -> tuple[SacState, Metrics]:
+    """Makes one update for each batch, `[num_updates, batch_size]`, in order; see `update`."""
     num_updates = batches.reward_t.shape[0]
     keys = jax.random.split(state.key, num_updates + 1)
     numbers = state.updates + jnp.arange(num_updates)
 
     def body(learner, inputs):
         batch, key, number = inputs
-        updated, metrics = update(learner, batch, key, config)
+        updated, metrics = update(learner, batch, key, config, prior_share)
         if config.critic_warmup_updates:
             warming = number < config.critic_warmup_updates
             frozen = updated.replace(
@@ -469,6 +489,7 @@ def step(
     reward_fn: RewardFn | None = None,
     reward_params: Params = None,
     recompute_rewards: bool = False,
+    prior_share: jax.Array | float = 1.0,
 ) -> tuple[SacState, Metrics]:
     """Takes one vectorised environment step and learns from the buffer.
 
@@ -480,6 +501,7 @@ def step(
       reward_params: its parameters.
       recompute_rewards: whether the reward is evaluated when a batch is drawn, for a reward that
         changes, rather than once when a transition is stored.
+      prior_share: see `update`.
 
     Returns:
       The next state and metrics, averaged over updates; `env_reward` is the true one.
@@ -488,7 +510,7 @@ def step(
     state, batches = draw(state, env, config)
     if recompute_rewards:
         batches = with_reward(batches, reward_fn, reward_params)
-    state, metrics = learn(state, batches, config)
+    state, metrics = learn(state, batches, config, prior_share)
     return state, {**metrics, "env_reward": jnp.mean(transitions.reward_t)}
 
 
@@ -499,14 +521,14 @@ def train(
     num_steps: int,
     reward_fn: RewardFn | None = None,
     reward_params: Params = None,
+    prior_share: jax.Array | float = 1.0,
 ) -> tuple[SacState, Metrics]:
     """Scans `step`; metrics are averaged over the steps."""
-    state, metrics = jax.lax.scan(
-        lambda state, _: step(state, env, config, reward_fn, reward_params),
-        state,
-        None,
-        length=num_steps,
-    )
+
+    def body(state, _):
+        return step(state, env, config, reward_fn, reward_params, prior_share=prior_share)
+
+    state, metrics = jax.lax.scan(body, state, None, length=num_steps)
     return state, jax.tree.map(jnp.mean, metrics)
 
 

@@ -12,7 +12,7 @@ from represent_jax.stages import airl, decomposition, policies
 from represent_jax.stages.airl import AirlConfig
 from represent_jax.stages.curve import CurveConfig
 from represent_jax.stages.noise import NoiseConfig
-from represent_jax.stages.policies import PoliciesConfig
+from represent_jax.stages.policies import PoliciesConfig, TaskPolicyConfig
 from represent_jax.stages.regression_config import RegressionConfig
 from represent_jax.stages.selection import SelectionConfig
 
@@ -136,6 +136,7 @@ class RepresentConfig(MethodConfig):
       policy_targets: targets that a policy is trained for; all if empty.
       airl, noise, curve, regression, policies, selection: settings of the stages; nothing is
         selected where only one policy is trained, or the rewards are not of one task.
+      task_policy: what is different for the policy on R^0.
     """
 
     policy_targets: tuple[str, ...] = ()
@@ -145,6 +146,7 @@ class RepresentConfig(MethodConfig):
     regression: RegressionConfig = RegressionConfig()
     policies: PoliciesConfig = PoliciesConfig()
     selection: SelectionConfig = SelectionConfig()
+    task_policy: TaskPolicyConfig = later(TaskPolicyConfig())
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -152,6 +154,23 @@ class RepresentConfig(MethodConfig):
             if name not in self.target_names:
                 raise unknown("policy target", name, self.target_names)
         check_start(self.airl, self.policies)
+        require(
+            not self.clones_for_task or self.airl.cloning_updates > 0,
+            "airl.cloning_updates",
+            "above 0 where task_policy.start=clone",
+            self.airl.cloning_updates,
+        )
+        require(
+            self.task_policy.prior_half_life is None or self.policies.agent == "sac",
+            "task_policy.prior_half_life",
+            f"none with policies.agent={self.policies.agent}, which has no prior",
+            self.task_policy.prior_half_life,
+        )
+
+    @property
+    def clones_for_task(self) -> bool:
+        """Whether the policy on R^0 starts from a clone of all demonstrations."""
+        return self.policies.start == "phase1" and self.task_policy.start == "clone"
 
     @property
     def target_names(self) -> tuple[str, ...]:
@@ -175,9 +194,10 @@ class RepresentConfig(MethodConfig):
 
     @property
     def needs_actions(self) -> str:
-        """Phase 1 as it is set, and rewards that see actions; others do without."""
-        needed = "regression.include_action=true" if self.regression.include_action else ""
-        return self.airl.needs_actions or needed
+        """Phase 1 as it is set, rewards that see actions, and clones; others do without."""
+        seen = "regression.include_action=true" if self.regression.include_action else ""
+        cloned = "task_policy.start=clone" if self.clones_for_task else ""
+        return self.airl.needs_actions or seen or cloned
 
     def check_against(self, obs_dim: int) -> None:
         decomposition.check_entries(self.regression, obs_dim)

@@ -112,9 +112,8 @@ def plan(
         return {"rewards": found}
 
     def train(key, directory, base, noisy, params):
-        starts = None
-        if config.policies.start == "phase1":
-            starts = [member_of(base.policy, 0)]
+        warm = config.policies.start == "phase1"
+        starts = (lambda: [member_of(base.policy, 0)]) if warm else None
         return policy_learning.run(
             key,
             config.policies,

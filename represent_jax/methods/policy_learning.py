@@ -59,7 +59,7 @@ def run(
     env: Episode,
     objectives: Sequence[policies.Objective],
     reward_fn: RewardFn,
-    starts: Sequence[PolicyParams] | None,
+    starts: Callable[[], Sequence[PolicyParams]] | None,
     directory: RunDirectory,
     checkpoint_seconds: float,
 ) -> Trained:
@@ -72,22 +72,24 @@ def run(
       env: episodes to learn in.
       objectives: what to maximise.
       reward_fn: the reward whose parameters the objectives hold.
-      starts: the policy that each begins as; None where there are none, for a cold start.
+      starts: makes the policy that each begins as; None where there are none, for a cold start.
       directory: where the stage is saved, and restored from.
       checkpoint_seconds: least time between two checkpoints.
     """
     key_start, key = jax.random.split(key)
-    if starts is None:
-        starts = [_random_policy(key_start, env, config)] * len(objectives)
-    members = list(zip(objectives, starts, strict=True))
 
     def init(key, member):
         return policies.init(key, env, *member, config, reward_fn)
 
     if directory.is_done("policies"):
-        example = policies.finish(jax.eval_shape(init, key, members[0]), config)
-        example = jax.tree.map(lambda x: shape_like(x, len(members)), example)
+        example = jax.eval_shape(lambda key: _random_policy(key, env, config), key)
+        example = jax.tree.map(lambda x: shape_like(x, len(objectives)), example)
         return Trained(directory.load_output("policies", example), directory.read_log("policies"))
+    if starts is None:
+        begun = [_random_policy(key_start, env, config)] * len(objectives)
+    else:
+        begun = starts()
+    members = list(zip(objectives, begun, strict=True))
     population = Population(
         members, population, lambda state: policies.population_axes(state, config)
     )

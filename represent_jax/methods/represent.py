@@ -11,9 +11,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from represent_jax.agents import cloning
 from represent_jax.agents import rollout as rollouts
 from represent_jax.data.trajectories import pad
-from represent_jax.envs import Environment, Episode
+from represent_jax.envs import Environment
 from represent_jax.methods import pipeline, policy_learning, results
 from represent_jax.methods.config import Problem, RepresentConfig
 from represent_jax.methods.plan import Stage
@@ -112,8 +113,11 @@ def last_stages(
 
     def train(key, directory, first, rewards) -> Trained:
         key_start, key = jax.random.split(key)
-        objectives = _objectives(config, problem.env, views(rewards))
-        starts = _starts(key_start, config, problem.env, objectives, first, reward_fn)
+        objectives = _objectives(config, problem, views(rewards), reward_fn)
+
+        def starts():
+            return _starts(key_start, config, problem, objectives, first, reward_fn)
+
         return policy_learning.run(
             key,
             config.policies,
@@ -121,20 +125,20 @@ def last_stages(
             problem.env,
             list(objectives.values()),
             reward_fn,
-            starts,
+            None if config.policies.start == "cold" else starts,
             directory,
             checkpoint_seconds,
         )
 
     def select(key, directory, rewards, trained) -> Trained:
-        objectives = _objectives(config, problem.env, views(rewards))
+        objectives = _objectives(config, problem, views(rewards), reward_fn)
         chosen = config.selection
         margins = [
             chosen.task_margin if name == "task" else chosen.strategy_margin for name in objectives
         ]
         task, floors = None, None
         if chosen.task_floor:
-            task = _objective(config, problem.env, views(rewards)["task"])
+            task = _objective(config, problem, "task", views(rewards)["task"], reward_fn)
             floors = task_floors(config, problem, reward_fn, task.params)
         return policy_learning.select(
             key,
@@ -162,6 +166,8 @@ def last_stages(
     settings = {"policies": config.policies, "population": config.population}
     if config.policy_names != config.target_names:
         settings["policy_targets"] = config.policy_names
+    if config.task_policy != policies.TaskPolicyConfig():
+        settings["task_policy"] = config.task_policy
     selection, handed_on = (), "policies"
     if config.selects:
         selection = (
@@ -234,18 +240,29 @@ def _reward_fn(config: RepresentConfig) -> RewardFn:
 
 
 def _objectives(
-    config: RepresentConfig, env: Episode, views: dict[str, Params]
+    config: RepresentConfig, problem: Problem, views: dict[str, Params], reward_fn: RewardFn
 ) -> dict[str, policies.Objective]:
     return {
-        name: _objective(config, env, view)
+        name: _objective(config, problem, name, view, reward_fn)
         for name, view in views.items()
         if name in config.policy_names
     }
 
 
-def _objective(config: RepresentConfig, env: Episode, view: Params) -> policies.Objective:
+def _objective(
+    config: RepresentConfig, problem: Problem, name: str, view: Params, reward_fn: RewardFn
+) -> policies.Objective:
+    """What is maximised for the target called `name`; of one structure for all."""
+    env, different = problem.env, config.task_policy
     scale = env.horizon / config.regression.return_scale
-    return policies.make_objective(view, scale, env, config.policies)
+    objective = policies.make_objective(view, scale, env, config.policies)
+    if name == "task":
+        every = pad(problem.demonstrations.trajectories, env.horizon)
+        objective = policies.task_objective(objective, every, different, reward_fn)
+    if different.prior_half_life is None:
+        return objective
+    steps = different.prior_half_life if name == "task" else jnp.inf
+    return objective._replace(prior_half_life=jnp.float32(steps))
 
 
 def task_floors(
@@ -265,20 +282,36 @@ def task_floors(
 def _starts(
     key: jax.Array,
     config: RepresentConfig,
-    env: Episode,
+    problem: Problem,
     objectives: dict[str, policies.Objective],
     first: airl.AirlOutput,
     reward_fn: RewardFn,
 ) -> Sequence[policies.PolicyParams]:
-    """Phase 1's policy of each strategy; for the task that of the highest learned return."""
+    """Phase 1's policy of each strategy; for the task see `TaskPolicyConfig.start`."""
     own = {name: member_of(first.policy, i) for i, name in enumerate(config.group_names)}
 
     def start_of(name, objective):
         if name in own:
             return own[name]
+        if config.clones_for_task:
+            return clone_all(key, config, problem)
         candidates = list(own.values())
         return policy_learning.best_start(
-            key, env, objective, candidates, config.policies, reward_fn
+            key, problem.env, objective, candidates, config.policies, reward_fn
         )
 
     return [start_of(name, objective) for name, objective in objectives.items()]
+
+
+def clone_all(key: jax.Array, config: RepresentConfig, problem: Problem) -> policies.PolicyParams:
+    """A clone of all demonstrations, as Phase 1 clones those of a strategy."""
+    module, settings = policies.agent_of(config.policies)
+    rows = pipeline.transitions(problem.lessons.trajectories)
+    num_updates, noise = config.airl.cloning_updates, config.airl.cloning_noise
+
+    @jax.jit
+    def clone(key, rows):
+        keys = jax.random.split(key)
+        return cloning.start(*keys, module, settings, problem.env, rows, num_updates, noise)
+
+    return clone(key, rows)

@@ -19,6 +19,7 @@ from represent_jax.methods.plan import Stage
 from represent_jax.methods.population import member_of
 from represent_jax.runs import RunDirectory
 from represent_jax.stages import decomposition
+from represent_jax.stages.policies import TaskPolicyConfig
 from represent_jax.stages.regression_config import RegressionConfig
 
 # What is left of Phase 3 where there is one reward; a single curve has no unit to learn.
@@ -32,7 +33,11 @@ _NOTHING_ELSE = {
 
 @dataclasses.dataclass(frozen=True)
 class SsrrConfig(RepresentConfig):
-    """Settings of SSRR: those of REPRESENT without R~^i, so without Eq. 4 and Eq. 5."""
+    """Settings of SSRR: those of REPRESENT without R~^i, so without Eq. 4 and Eq. 5.
+
+    Its rewards are fitted to a curve each, whose unit they have, and what is learned of merged
+    demonstrations starts from a clone of all: nothing is different for the task.
+    """
 
     method: str = "ssrr"
     grouping: str = "merged"
@@ -44,6 +49,8 @@ class SsrrConfig(RepresentConfig):
             found = getattr(self.regression, field)
             expected = f"{nothing}, SSRR decomposes nothing"
             require(found == nothing, f"regression.{field}", expected, found)
+        nothing, found = TaskPolicyConfig(), self.task_policy
+        require(found == nothing, "task_policy", f"{nothing}, SSRR has no R^0 of its own", found)
 
     @property
     def target_names(self) -> tuple[str, ...]:
@@ -53,8 +60,8 @@ class SsrrConfig(RepresentConfig):
 
 def configure(settings: dict[str, Any]) -> dict[str, Any]:
     """Turns the settings of a preset and a domain into SSRR's."""
-    own = settings["regression"]
-    return settings | {"regression": dataclasses.replace(own, **_NOTHING_ELSE)}
+    own = dataclasses.replace(settings["regression"], **_NOTHING_ELSE)
+    return settings | {"regression": own, "task_policy": TaskPolicyConfig()}
 
 
 def plan(

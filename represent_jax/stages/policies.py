@@ -2,8 +2,10 @@
 
 A learned reward R is used as rho = scale * R - center, where a noise-free episode of Phase 1
 earns about 1 a step before the center is subtracted: an agent that starts from Phase 1's policy is
-then paid only for getting better. Starting from that policy is what makes improvement reliable:
-from random networks, SAC finds local optima of the same reward below what running well would pay.
+then paid only for getting better. That is the unit of the noise-performance curve, and says little
+of how much more the best states pay than others, which a `span` sets instead. Starting from that
+policy is what makes improvement reliable: from random networks, SAC finds local optima of the same
+reward below what running well would pay.
 """
 
 import dataclasses
@@ -21,6 +23,7 @@ from represent_jax.agents.sac import PolicyParams, SacConfig
 from represent_jax.config import later, require
 from represent_jax.data.trajectories import TrajectoryBatch
 from represent_jax.envs.episode import Episode
+from represent_jax.errors import RepresentError
 from represent_jax.types import Metrics, Params, RewardFn
 
 
@@ -33,8 +36,8 @@ class PoliciesConfig:
         before its first update, `sac.warmup_env_steps`, are not counted.
       agent: "sac" or "ppo".
       start: "phase1" starts from Phase 1's policy, "cold" from random networks.
-      keep: which policy is handed on: of those evaluated the "best" by learned return, Phase 1's
-        among them where it is the start, or the "last".
+      keep: which policy is handed on: of those evaluated the "best" by learned return, the one
+        it started from among them unless that is cold, or the "last".
       center: subtracted from rho at every step, unless episodes can end early: there a negative
         reward would pay for ending them.
       eval_env_steps: environment steps between two evaluations.
@@ -70,6 +73,33 @@ class PoliciesConfig:
             require(getattr(self, field) >= 1, field, "at least 1", getattr(self, field))
 
 
+@dataclasses.dataclass(frozen=True)
+class TaskPolicyConfig:
+    """What is different for the policy on R^0, beside policies on rewards R^i.
+
+    Attributes:
+      start: with a warm start, "phase1" starts from the Phase 1 policy that earns most of R^0,
+        "clone" from a clone of all demonstrations, which knows every style's states.
+      span: what R^0 is scaled to differ by, a step, between the worst and the best of demonstrated
+        states. R^i add up to the curve, whose unit they have; R^0 has what R~^i leave it, so that
+        in that unit, if none, SAC's temperature and prior weigh more against it.
+      prior_half_life: environment steps in which the weights of SAC's prior and of a temperature
+        that is not learned halve, seen anew at every evaluation; they stay if none. Critics
+        that know little need the prior, those that know R^0 well are held back by it. R~^i sees
+        enough to be deceived without it.
+    """
+
+    start: str = "phase1"
+    span: float | None = None
+    prior_half_life: int | None = None
+
+    def __post_init__(self) -> None:
+        require(self.start in ("phase1", "clone"), "start", "'phase1' or 'clone'", self.start)
+        for field in ("span", "prior_half_life"):
+            found = getattr(self, field)
+            require(found is None or found > 0, field, "positive, or none", found)
+
+
 def agent_of(config: PoliciesConfig) -> tuple[ModuleType, SacConfig | PpoConfig]:
     """The agent's module and settings."""
     return find_agent(config.agent), getattr(config, config.agent)
@@ -81,11 +111,14 @@ class Objective(NamedTuple):
     Attributes:
       params: parameters of the learned reward R.
       scale, center: `[]`.
+      prior_half_life: environment steps in which the prior's weight halves, `[]`; infinite, or None
+        where that goes for all targets, if it stays.
     """
 
     params: Params
     scale: jax.Array
     center: jax.Array
+    prior_half_life: jax.Array | None = None
 
 
 @struct.dataclass
@@ -94,7 +127,7 @@ class PolicyState:
 
     Attributes:
       agent: the agent's.
-      best: the policy with the highest learned return of those evaluated, Phase 1's included.
+      best: the policy with the highest learned return of those evaluated, the first included.
       best_learned_return: `[]`.
     """
 
@@ -121,6 +154,37 @@ def make_objective(params: Params, scale: float, env: Episode, config: PoliciesC
     return Objective(params, jnp.float32(scale), jnp.float32(center))
 
 
+def task_objective(
+    objective: Objective,
+    demonstrations: TrajectoryBatch,
+    config: TaskPolicyConfig,
+    reward_fn: RewardFn,
+) -> Objective:
+    """Makes of an objective on R^0 what its settings ask for.
+
+    Args:
+      objective: as for any reward.
+      demonstrations: among whose states R^0 is to have the span, `[num_demonstrations]`.
+      config: settings.
+      reward_fn: the learned reward R.
+
+    Raises:
+      RepresentError: R^0 is the same in all of these states, so that no scale makes it differ.
+    """
+    if config.span is None:
+        return objective
+    obs_t, next_obs_t = demonstrations.obs[:, :-1], demonstrations.obs[:, 1:]
+    reward_t = reward_fn(objective.params, obs_t, demonstrations.actions, next_obs_t)
+    happened = demonstrations.mask > 0
+    low = jnp.min(reward_t, where=happened, initial=jnp.inf)
+    width = jnp.max(reward_t, where=happened, initial=-jnp.inf) - low
+    if not width > 0.0:
+        raise RepresentError(f"task_policy.span: R^0 is {low:g} in every demonstrated state")
+    scale = jnp.float32(config.span / width)
+    # The worst of these states pays nothing before the center is subtracted.
+    return objective._replace(scale=scale, center=objective.center + scale * low)
+
+
 def _maximised(reward_fn: RewardFn) -> RewardFn:
     def maximised(objective, obs_t, action_t, next_obs_t):
         learned = reward_fn(objective.params, obs_t, action_t, next_obs_t)
@@ -143,7 +207,7 @@ def init(
       key: PRNG key.
       env: episodes to learn in.
       objective: the reward's parameters, scale and center.
-      policy: Phase 1's.
+      policy: to start from.
       config: settings.
       reward_fn: the learned reward R.
     """
@@ -182,6 +246,9 @@ def train(
     """Trains for `eval_env_steps`, evaluates, and keeps the better policy by learned return."""
     agent, settings = agent_of(config)
     num_steps = steps_per_evaluation(config)
+    weaker = {}
+    if objective.prior_half_life is not None:
+        weaker["prior_share"] = 0.5 ** (state.agent.env_steps / objective.prior_half_life)
     agent_state, metrics = agent.train(
         state.agent,
         env,
@@ -189,6 +256,7 @@ def train(
         num_steps,
         reward_fn=_maximised(reward_fn),
         reward_params=objective,
+        **weaker,
     )
     key_eval, key = jax.random.split(agent_state.key)
     policy = agent.policy_of(agent_state.learner)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import probes
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from represent_jax.agents import sac
 from represent_jax.errors import UsageError
@@ -253,6 +254,22 @@ def test_without_rewards_the_actor_returns_to_the_policy_it_started_from():
     before = distance(state.learner)
     after, _ = jax.lax.scan(update, state.learner, jax.random.split(KEY, 1_500))
     assert before > 0.3 and distance(after) < 0.3 * before
+
+
+def test_a_share_of_the_prior_is_a_smaller_weight_and_temperature():
+    small = {"normalize_observations": False, "learn_temperature": False}
+    whole = dataclasses.replace(SMALL, prior_weight=0.4, initial_temperature=0.8, **small)
+    half = dataclasses.replace(whole, prior_weight=0.2, initial_temperature=0.4)
+    first = sac.policy_of(sac.init_learner(KEY, ENV.observation_size, ENV.action_size, whole))
+
+    def trained(config, prior_share):
+        state = sac.init(KEY, ENV, config, policy_params=first)
+        learner = sac.train(state, ENV, config, 2, prior_share=prior_share)[0].learner
+        return ravel_pytree((learner.policy_params, learner.q_params))[0]
+
+    expected = trained(half, 1.0)
+    np.testing.assert_allclose(trained(whole, jnp.float32(0.5)), expected, atol=1e-5)
+    assert np.abs(trained(whole, 1.0) - expected).max() > 1e-4
 
 
 def test_without_a_weight_no_prior_is_kept():

@@ -14,10 +14,13 @@ import pytest
 from launcher import ROOT, finish, launch, log_of, results_of
 
 import represent_jax as rj
+from represent_jax.config import apply_overrides
 from represent_jax.errors import RepresentError, UsageError
 from represent_jax.methods import represent
 from represent_jax.methods.config import make_problem
+from represent_jax.methods.pipeline import transitions
 from represent_jax.methods.presets import make_config
+from represent_jax.stages import policies
 
 PENDULUM = ("--env=inverted_double_pendulum", "--backend=mujoco")
 
@@ -137,6 +140,44 @@ def test_floors_are_what_the_demonstrators_of_each_target_earn_of_the_task(group
     ]
     assert floors[0] == -np.inf
     np.testing.assert_allclose(floors[1:], expected, rtol=1e-4)
+
+
+def test_the_tasks_policy_starts_from_a_clone_of_all_demonstrations():
+    wide = ("airl.cloning_updates=1_000", "policies.sac.hidden_sizes=64,64")
+    wide = (*wide, "airl.sac.hidden_sizes=64,64")
+    config = make_config("smoke", "half_cheetah")
+    config = apply_overrides(config, ["task_policy.start=clone", *wide])
+    shipped = rj.load_demonstrations("half_cheetah")
+    env = rj.make_env("half_cheetah", "mujoco")
+
+    def mean_action(sign):
+        """Of a clone of those who press one way in strategy 1, and the way of `sign` in others."""
+        driven = tuple(
+            dataclasses.replace(t, actions=np.full_like(t.actions, 0.5 * sign**t.strategy))
+            for t in shipped.trajectories
+        )
+        driven = dataclasses.replace(shipped, trajectories=driven)
+        problem = make_problem(config, env, driven)
+        clone = represent.clone_all(jax.random.PRNGKey(0), config, problem)
+        obs = transitions(problem.lessons.trajectories).obs_t
+        return float(np.mean(policies.act(clone, obs, env.action_size, config.policies)))
+
+    assert mean_action(1) > 0.2 > abs(mean_action(-1))
+
+
+def test_what_is_different_for_the_task_needs_what_it_is_made_of():
+    config = make_config("smoke", "half_cheetah")
+    cloned = apply_overrides(config, ["task_policy.start=clone"])
+    assert cloned.needs_actions == "task_policy.start=clone"
+    cold = apply_overrides(cloned, ["policies.start=cold", "airl.cloning_updates=0"])
+    assert not cold.needs_actions
+    message = "airl.cloning_updates: expected above 0 where task_policy.start=clone"
+    with pytest.raises(UsageError, match=message):
+        apply_overrides(cloned, ["airl.cloning_updates=0"])
+    with pytest.raises(UsageError, match="which has no prior"):
+        apply_overrides(config, ["policies.agent=ppo", "task_policy.prior_half_life=100"])
+    with pytest.raises(UsageError, match=r"task_policy.* SSRR has no R\^0"):
+        apply_overrides(make_config("smoke", "half_cheetah", "ssrr"), ["task_policy.span=2"])
 
 
 def test_evaluate_judges_a_finished_run(finished):

@@ -9,9 +9,10 @@ import pytest
 
 from represent_jax.agents import sac
 from represent_jax.agents.sac import SacConfig
-from represent_jax.errors import UsageError
+from represent_jax.data.trajectories import Trajectory, pad
+from represent_jax.errors import RepresentError, UsageError
 from represent_jax.stages import policies
-from represent_jax.stages.policies import PoliciesConfig
+from represent_jax.stages.policies import PoliciesConfig, TaskPolicyConfig
 
 CONFIG = PoliciesConfig(sac=SacConfig(hidden_sizes=(8, 8)))
 SAMPLED = dataclasses.replace(CONFIG, actions="sampled")
@@ -52,6 +53,45 @@ def test_sampled_actions_are_distributed_as_the_policy_says(policy):
     np.testing.assert_allclose(found.std(axis=0), drawn.std(axis=0), atol=0.04)
     apart = np.corrcoef(np.asarray(found[1:, 0]), np.asarray(found[:-1, 0]))[0, 1]
     assert abs(apart) < 0.06
+
+
+def _height(slope, obs_t, action_t, next_obs_t):
+    return slope * next_obs_t[..., 0]
+
+
+def _climbs(*heights):
+    """Trajectories of states alone."""
+    rows = [np.array(each, np.float32)[:, None] for each in heights]
+    return pad([Trajectory(each, None, None, False, 0) for each in rows], 3)
+
+
+@pytest.mark.parametrize("center", [0.0, 1.0])
+def test_demonstrated_states_pay_from_nothing_to_the_span(center):
+    # Nothing led to the first states, 3 and 9, so they pay nothing.
+    batch = _climbs([3.0, 1.0, 4.0, 2.0], [9.0, 2.0, 3.0, 5.0])
+    objective = policies.Objective(0.5, jnp.float32(7.0), jnp.float32(center))
+    found = policies.task_objective(objective, batch, TaskPolicyConfig(span=6.0), _height)
+    paid = found.scale * 0.5 * np.array([1.0, 2.0, 5.0]) - found.center
+    np.testing.assert_allclose(paid, np.array([0.0, 1.5, 6.0]) - center, atol=1e-5)
+    unchanged = policies.task_objective(objective, batch, TaskPolicyConfig(), _height)
+    assert unchanged is objective
+
+
+def test_steps_beyond_an_episode_set_no_span():
+    batch = _climbs([0.0, 1.0, 3.0], [0.0, 1.0])
+    batch.obs[1, 2:] = 99.0
+    objective = policies.Objective(1.0, jnp.float32(7.0), jnp.float32(0.0))
+    found = policies.task_objective(objective, batch, TaskPolicyConfig(span=2.0), _height)
+    np.testing.assert_allclose(found.scale, 1.0, rtol=1e-6)
+
+
+def test_a_task_without_a_span_is_refused():
+    objective = policies.Objective(2.0, jnp.float32(7.0), jnp.float32(0.0))
+    with pytest.raises(RepresentError, match="R\\^0 is 2 in every demonstrated state"):
+        policies.task_objective(objective, _climbs([1.0] * 3), TaskPolicyConfig(span=1.0), _height)
+    for setting in ("span", "prior_half_life"):
+        with pytest.raises(UsageError, match=f"{setting}: expected positive, or none, found 0"):
+            TaskPolicyConfig(**{setting: 0})
 
 
 def test_other_actions_are_refused():
