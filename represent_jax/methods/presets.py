@@ -185,7 +185,7 @@ DOMAINS: dict[str, tuple[str, ...]] = {
         # it sees the kettle alone, so that nothing else is to be had where these fade.
         "task_policy.start=clone",
         "task_policy.span=2",
-        "task_policy.prior_half_life=40_000",
+        "task_policy.prior_half_life=80_000",
         # One random speed of full size in every joint throws the hand a decimetre, past the kettle
         # or into it; a fifth slows the arm down.
         "noise.action_size=0.2",
