@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import probes
+from jax.flatten_util import ravel_pytree
 
 from represent_jax.agents import sac
 from represent_jax.stages import policies
@@ -46,3 +47,22 @@ def test_a_cold_start_is_beaten_by_any():
     assert state.best_learned_return == -jnp.inf
     after, metrics = policies.train(state, ENV, OBJECTIVE, cold, probes.reward)
     assert after.best_learned_return == metrics["learned_return"]
+
+
+def test_the_prior_of_a_task_fades_with_its_steps():
+    fixed = dataclasses.replace(SMALL, learn_temperature=False)
+    whole = dataclasses.replace(fixed, prior_weight=0.8, initial_temperature=0.4)
+    quarter = dataclasses.replace(fixed, prior_weight=0.2, initial_temperature=0.1)
+
+    def trained(sac_config, half_life):
+        config = dataclasses.replace(CONFIG, sac=sac_config)
+        _, state = begin(config)
+        # Twelve steps of warm-up are two half-lives of six.
+        assert state.agent.env_steps == 12
+        objective = OBJECTIVE._replace(prior_half_life=half_life)
+        after, _ = policies.train(state, ENV, objective, config, probes.reward)
+        return ravel_pytree(after.agent.learner.policy_params)[0]
+
+    expected = trained(quarter, None)
+    np.testing.assert_allclose(trained(whole, jnp.float32(6.0)), expected, atol=1e-5)
+    assert np.abs(trained(whole, jnp.float32(jnp.inf)) - expected).max() > 1e-4
